@@ -18,7 +18,7 @@ from typing import NamedTuple
 from kalmark.config import build_slam
 from kalmark.config.building import config_dict
 from kalmark.diagnosis.mistakes import measured
-from kalmark.diagnosis.readings import ARM, CONSTANT, NAMES, SCALE, SIGMA, SIGN
+from kalmark.diagnosis.state_readings import ARM, CONSTANT, NAMES, SCALE, SIGMA, SIGN
 from kalmark.diagnosis.verdict import MISFIT, diagnose
 from kalmark.results.record import record
 from kalmark.simulate import load_world, simulate

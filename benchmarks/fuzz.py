@@ -284,7 +284,7 @@ def a_bag(ros1: bool) -> bytes:
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
 
-    from kalmark.logs.bag.write import Types, header
+    from kalmark.logs.bag.mcap_writer import Types, header
 
     types_ = Types(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE))
     encode = types_.store.serialize_ros1 if ros1 else types_.store.serialize_cdr

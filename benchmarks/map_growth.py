@@ -40,7 +40,7 @@ from field import ODOMETRY, SIGHT, STEP_M, Field, Step
 
 import kalmark as km
 from kalmark.filter import kernels
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 
 GIB = 2.0**30
 QUICK = {"lane_m": 3.0, "reach_m": 3.2}

@@ -35,7 +35,7 @@ from kalmark.geometry.spaces import mount_space
 from kalmark.models.protocols import calibrating, parameter_covariance
 from kalmark.simulate import load_world
 from kalmark.simulate.robots import simulation
-from kalmark.slam.motion import bias_name
+from kalmark.slam.held_control import bias_name
 
 WORLDS = (
     "differential_drive", "tricycle", "omnidirectional", "mecanum", "slipping_unicycle", "constant_velocity",

@@ -20,7 +20,7 @@ from hall import hall, mapped, right
 
 import kalmark as km
 from kalmark.arrays import Array
-from kalmark.management.repeats import repeats
+from kalmark.management.repeated_places import repeats
 
 REACH_M, SIGMA_M = 8.0, 0.03
 World = Callable[[np.random.Generator], Array]

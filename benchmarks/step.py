@@ -25,7 +25,7 @@ from ways import Isam2, Known, Process, Textbook, Way, conditions, in_turns, pin
 
 import kalmark as km
 from kalmark.filter import corrections, kernels, prediction
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.estimators import Invariant
 from kalmark.geometry.frames import compose
 

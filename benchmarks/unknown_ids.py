@@ -22,8 +22,8 @@ from scipy.optimize import linear_sum_assignment
 import kalmark as km
 from kalmark import config as cfg
 from kalmark.cli.run import run_log
+from kalmark.results.association_errors import known_as
 from kalmark.results.evaluate import known_landmarks
-from kalmark.results.matching import known_as
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.record import record
 from kalmark.results.run import Run

@@ -28,7 +28,7 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam, open_run
 from kalmark.filter.kernels import one_thread
 from kalmark.geometry.frames3d import compose, from_frame_many, to_frame_many
-from kalmark.slam.rehearsal import without_detectors
+from kalmark.slam.warm_up_events import without_detectors
 from vision import similarity
 
 CAMERA, SHIFTS_MS, NOISE_PX, NEAR_M, FAR_M = "cam0", (-10, -5, -2.5, 0, 2.5, 5, 10), 0.16, 0.5, 20.0

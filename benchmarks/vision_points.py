@@ -22,7 +22,7 @@ from kalmark.filter.kernels import one_thread
 from kalmark.geometry.frames3d import from_frame_many, minus, to_frame_many
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
-from kalmark.slam.rehearsal import without_detectors
+from kalmark.slam.warm_up_events import without_detectors
 
 IN_VIEW, STARTS, MARGIN, APART = 60, 10, 13, 15  # landmarks in a frame, new ones, px to the border and between them
 HIDDEN = 0.1  # relative difference of depths beyond which something is in front

@@ -10,7 +10,7 @@ import numpy as np
 
 from kalmark.events import Control, Event, Scan
 from kalmark.logs import Log, open_log
-from kalmark.logs.bag.write import Outgoing, Types, header
+from kalmark.logs.bag.mcap_writer import Outgoing, Types, header
 from kalmark.logs.geodesy import earth_centred
 from laser_worlds import LaserWorld
 

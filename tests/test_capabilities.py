@@ -10,7 +10,7 @@ import pytest
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import HEADING, RHO, VECTOR, Space
 from kalmark.models import landmarks
-from kalmark.models.check import check_model
+from kalmark.models.model_check import check_model
 from kalmark.models.pointwise import jacobian
 from kalmark.models.protocols import place_of
 from kalmark.models.sensors import RangeBearing

@@ -13,7 +13,7 @@ from kalmark.config.building import build_slam
 from kalmark.config.opening import open_run
 from kalmark.errors import ConfigError, LogError
 from kalmark.logs.known_map import read_known
-from kalmark.logs.write import write_native
+from kalmark.logs.native_writer import write_native
 from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 

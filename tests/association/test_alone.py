@@ -9,7 +9,7 @@ import pytest
 
 import kalmark as km
 from kalmark.association.query import Query
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 
 START = np.array([2.0, 2.0, 0.3])
 

@@ -11,7 +11,7 @@ import kalmark as km
 from kalmark.association.matchings import Places, best_matching, matchings
 from kalmark.association.query import Query
 from kalmark.errors import EventError
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.geometry.gaussian import gate
 from kalmark.tracks.scan import ScanContext
 

@@ -9,9 +9,9 @@ import numpy as np
 
 import kalmark as km
 from kalmark.logs import write_native
+from kalmark.results.association_errors import by_position
 from kalmark.results.evaluate import headline
-from kalmark.results.landmarks import MapLandmarks
-from kalmark.results.matching import by_position
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.run import Run
 
 POINTS = {7: (4.0, 1.0), 8: (6.0, -2.0), 9: (5.0, 4.0)}

@@ -12,10 +12,10 @@ import pytest
 
 import kalmark as km
 from batch_dense import Link, Sight, link, optimum
+from kalmark.batch.batch_state import POSES, State, plus
 from kalmark.batch.data import replayed
 from kalmark.batch.problem import Rows
 from kalmark.batch.solver import Batch
-from kalmark.batch.state import POSES, State, plus
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Fix, Scan, order
@@ -23,7 +23,7 @@ from kalmark.geometry import V, wrap
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import POINT2
 from kalmark.logs import open_log
-from kalmark.logs.write import write_native
+from kalmark.logs.native_writer import write_native
 from kalmark.results.batch import batch_entry, compare, given_by, solve_batch
 from kalmark.results.record import record
 from kalmark.results.run import Run

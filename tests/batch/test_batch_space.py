@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 
 import kalmark as km
+from kalmark.batch.batch_state import LANDMARKS, POSES, State
 from kalmark.batch.data import replayed
-from kalmark.batch.state import LANDMARKS, POSES, State
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Scan

@@ -11,9 +11,9 @@ import pytest
 from scipy.stats import chi2
 
 import kalmark as km
+from kalmark.batch.batch_state import FIRST_MOUNT
 from kalmark.batch.data import Associations, Given, replayed
 from kalmark.batch.solver import optimum
-from kalmark.batch.state import FIRST_MOUNT
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames3d, rotations
 from kalmark.models import tags

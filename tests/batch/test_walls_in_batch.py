@@ -6,7 +6,7 @@ import numpy as np
 
 import kalmark as km
 from kalmark.batch.data import replayed
-from kalmark.batch.walls import anchors
+from kalmark.batch.wall_anchors import anchors
 from kalmark.config import build_slam
 from kalmark.geometry.spaces import SE2
 from kalmark.models.landmarks import Wall2D

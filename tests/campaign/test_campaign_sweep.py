@@ -17,7 +17,7 @@ import pytest
 from pyarrow.parquet import read_table
 
 from kalmark.campaign import Sweep, open_cells, run_campaign, run_sweep
-from kalmark.campaign.keeping import Kept
+from kalmark.campaign.finished_runs import Kept
 from kalmark.campaign.running import Plan
 from kalmark.campaign.sweep import over_runs, run_figures
 from kalmark.cli import main
@@ -182,7 +182,7 @@ def test_another_campaign_does_not_mix_with_the_one_in_a_folder(
 
 def test_runs_of_other_code_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Kept(tmp_path, {"seed": 1}, {"": "a"})
-    monkeypatch.setattr("kalmark.campaign.keeping.code_digest", lambda: "another")
+    monkeypatch.setattr("kalmark.campaign.finished_runs.code_digest", lambda: "another")
     with pytest.raises(KalmarkError, match="code differs"):
         Kept(tmp_path, {"seed": 1}, {"": "a"})
 

@@ -12,8 +12,8 @@ import kalmark.models.motion
 import kalmark.models.sensors  # noqa: F401 - these register their models
 from command_line import Kalmark, refused, write_log_of_space
 from kalmark.declare import built_in
+from kalmark.results.figure_texts import figure
 from kalmark.results.measures import anees_interval
-from kalmark.results.words import figure
 
 
 def test_run_writes_the_run_folder_and_prints_its_figures(kalmark: Kalmark, log: Path, tmp_path: Path) -> None:

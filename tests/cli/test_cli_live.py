@@ -22,7 +22,7 @@ import pytest
 import kalmark as km
 from command_line import Kalmark
 from kalmark.cli.live import Checkpoints, Signals, serve
-from kalmark.logs.lines import KEYS, LONGEST_LINE, event_of, line_of, mapping_of
+from kalmark.logs.json_lines import KEYS, LONGEST_LINE, event_of, line_of, mapping_of
 from kalmark.results.live import Incoming, Live, converse
 
 CONFIG = """robots:

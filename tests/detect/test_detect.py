@@ -11,7 +11,7 @@ import pytest
 
 import kalmark as km
 from kalmark.detect import Corners, Detections, Reflectors, Trunks, Walls
-from kalmark.detect.scan import Laser
+from kalmark.detect.laser_scan import Laser
 from kalmark.geometry.angles import wrap
 from laser_worlds import ANGLES, FAR_M, SIGMA_M, LaserWorld, spread
 

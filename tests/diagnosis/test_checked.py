@@ -10,13 +10,13 @@ import pytest
 
 import kalmark as km
 from kalmark.config import build_slam, config_dict
-from kalmark.diagnosis import sightings
-from kalmark.diagnosis.gross import fit
+from kalmark.diagnosis import doubled_landmarks
+from kalmark.diagnosis.gross_mistakes import fit
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log, Trajectory
 from kalmark.results.evaluate import evaluate
 from kalmark.results.run import Run
-from kalmark.results.verdict import alarm, verdict_lines
+from kalmark.results.verdict_text import alarm, verdict_lines
 from kalmark.results.warnings import signs
 from kalmark.simulate import load_world, simulate
 
@@ -137,8 +137,8 @@ def test_things_in_a_map_twice_are_not_seen_again_where_they_were() -> None:
     half = log.events[len(log.events) // 2].t_ns
     doubled = with_scans(lambda e: e if e.t_ns < half else scan_of(e, ids=[1000 + int(str(i)) for i in e.ids or ()]))
     clean, twice = run_of(log), run_of(replace(log, events=[*map(doubled, log.events)]))
-    assert sightings.unseen(clean) is None
-    found = sightings.unseen(twice)
+    assert doubled_landmarks.unseen(clean) is None
+    found = doubled_landmarks.unseen(twice)
     assert found is not None and found.since_s > half * 1e-9 - 1.0
     verdict = km.diagnose(twice)
     assert verdict.map == "doubtful" and "unseen_landmarks" in [cause.name for cause in verdict.causes]

@@ -13,20 +13,20 @@ import pytest
 from hall import hall, mapped
 
 import kalmark as km
+from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import replayed
 from kalmark.batch.solver import optimum
-from kalmark.batch.state import LANDMARKS
 from kalmark.cli.app import main
 from kalmark.cli.run import run_log
 from kalmark.config import build_slam, config_dict
+from kalmark.diagnosis.batch_search import SEGMENT, thinned
 from kalmark.diagnosis.breakdown import breakdown, nees_parts
+from kalmark.diagnosis.cause_texts import words
 from kalmark.diagnosis.causes import Finding
-from kalmark.diagnosis.copies import copied
-from kalmark.diagnosis.gross import elsewhere, fit
+from kalmark.diagnosis.gross_mistakes import elsewhere, fit
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.searched import SEGMENT, thinned
+from kalmark.diagnosis.repeated_events import copied
 from kalmark.diagnosis.verdict import Verdict, causes_of
-from kalmark.diagnosis.words import words
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import SE3
@@ -35,7 +35,7 @@ from kalmark.logs.log import Log
 from kalmark.results.batch import given_by
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
-from kalmark.results.verdict import verdict_lines
+from kalmark.results.verdict_text import verdict_lines
 from kalmark.simulate import load_world, simulate
 
 WORLD = ("world.count=30", "world.size_m=24", "steps=400", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")

@@ -15,8 +15,8 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Control, Event, Scan, order
-from kalmark.logs.corrections import at_time
 from kalmark.logs.log import Log
+from kalmark.logs.log_corrections import at_time
 from kalmark.simulate import load_world, simulate
 
 Plant = Callable[[Log], Log]

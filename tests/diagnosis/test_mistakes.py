@@ -13,11 +13,11 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.config.tree import parse_value
-from kalmark.diagnosis.gross import FITS, fit, gross
+from kalmark.diagnosis.gross_mistakes import FITS, fit, gross
 from kalmark.diagnosis.mistakes import Mistake
 from kalmark.events import Control, Event, Scan
-from kalmark.logs.corrections import corrected
 from kalmark.logs.log import Log
+from kalmark.logs.log_corrections import corrected
 from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 

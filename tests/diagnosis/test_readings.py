@@ -10,7 +10,7 @@ import pytest
 import kalmark as km
 from kalmark.config.building import build_slam, config_dict
 from kalmark.diagnosis.mistakes import measured
-from kalmark.diagnosis.readings import NAMES, reasons
+from kalmark.diagnosis.state_readings import NAMES, reasons
 from kalmark.diagnosis.verdict import MISFIT, diagnose
 from kalmark.simulate import load_world
 from kalmark.simulate.robots import Simulation, simulation

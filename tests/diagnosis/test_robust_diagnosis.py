@@ -33,7 +33,7 @@ def solved(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
         return optimum(problem, *given, **more)
 
     if request.param == "unsolved":
-        monkeypatch.setattr("kalmark.diagnosis.searched.optimum", only_robust)
+        monkeypatch.setattr("kalmark.diagnosis.batch_search.optimum", only_robust)
 
 
 def run_of(change: Callable[[Scan], Scan], seed: int = 3) -> Run:

@@ -11,7 +11,7 @@ import pytest
 from hall import hall, mapped
 
 import kalmark as km
-from kalmark.diagnosis import sightings
+from kalmark.diagnosis import doubled_landmarks
 from kalmark.diagnosis.verdict import SHORT
 from kalmark.events import Control, Scan
 
@@ -31,18 +31,18 @@ def seen(*scans: str, **places: tuple[float, float]) -> Any:
 
 def test_one_thing_is_seen_in_turn_and_two_are_seen_together() -> None:
     in_turn = seen(*12 * ("ac", "bc", "ac", "ac", "bc"), a=NEAR, b=FAR, c=POST)
-    assert [(pair.name, pair.other) for pair in sightings.split(in_turn)] == [("a", "b")]
-    assert not sightings.split(seen(*12 * ("ac", "bc", "abc", "ac", "bc"), a=NEAR, b=FAR, c=POST))
+    assert [(pair.name, pair.other) for pair in doubled_landmarks.split(in_turn)] == [("a", "b")]
+    assert not doubled_landmarks.split(seen(*12 * ("ac", "bc", "abc", "ac", "bc"), a=NEAR, b=FAR, c=POST))
 
 
 def test_two_sides_of_a_wall_and_scans_of_single_landmarks_say_nothing() -> None:
-    assert not sightings.split(seen(*30 * ("ac",), *30 * ("bc",), a=NEAR, b=FAR, c=POST))
-    assert not sightings.split(seen(*30 * ("a", "b"), a=NEAR, b=FAR))
+    assert not doubled_landmarks.split(seen(*30 * ("ac",), *30 * ("bc",), a=NEAR, b=FAR, c=POST))
+    assert not doubled_landmarks.split(seen(*30 * ("a", "b"), a=NEAR, b=FAR))
 
 
 def test_landmarks_vanish_at_once_or_one_after_the_other() -> None:
     def moments(*scans: str) -> list[tuple[float, int, bool]]:
-        found = sightings.vanished(seen(*scans, **dict.fromkeys("abcdefghijkl", NEAR)))
+        found = doubled_landmarks.vanished(seen(*scans, **dict.fromkeys("abcdefghijkl", NEAR)))
         return [(moment.t_s, moment.number, moment.score > 0.0) for moment in found]
 
     before, after = 90 * ("abcdef",), 90 * ("ghijkl",)
@@ -58,7 +58,7 @@ def test_landmarks_vanish_at_once_or_one_after_the_other() -> None:
 def test_landmarks_that_ids_tell_do_not_vanish() -> None:
     run = seen(*90 * ("abcdef",), *90 * ("ghijkl",))
     run.history.id = run.history.landmark
-    assert sightings.vanished(run) == []
+    assert doubled_landmarks.vanished(run) == []
 
 
 @pytest.mark.parametrize("carried_m", [0.0, 5.0])

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import replayed
 from kalmark.batch.problem import sightings
-from kalmark.batch.state import LANDMARKS
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.mounts import _turns
+from kalmark.diagnosis.turned_mounts import _turns
 from kalmark.events import Scan
 from kalmark.geometry.frames import compose
 from kalmark.geometry.frames3d import compose as compose3d

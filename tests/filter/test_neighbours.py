@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.map import Pairs
-from kalmark.filter.neighbours import distances, paired
+from kalmark.filter.nearest_blocks import distances, paired
 
 
 def field(map_: str) -> tuple[km.Slam, np.ndarray]:

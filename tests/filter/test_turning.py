@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 import kalmark as km
-from kalmark.filter import turning
+from kalmark.filter import gauge_transport
 from kalmark.geometry.frames import compose
 from kalmark.geometry.frames3d import compose as compose3
 from kalmark.geometry.rotations import exp, matrix
@@ -193,16 +193,16 @@ def test_a_correction_along_what_a_robot_and_its_mount_leave_open_moves_no_senso
     N = np.vstack([-np.linalg.solve(H[:, :k], H[:, k:]), np.eye(k)])
     P = N @ np.diag(rng.uniform(0.01, 0.04, k)) @ N.T + 1e-10 * np.eye(2 * k)
     d, after, moved = N @ rng.normal(0, 0.3, k), x.copy(), retract_plane if plane else retract
-    rows = turning.turning_rows(space.atoms, (n, 2 * n, t, 2 * k, 0, 0), H)
-    R, turn = turning.frame_of(x, 0, t), turning.gauge(x, d, rows, t)
-    L = turning.leaning(P[rows[0]], rows[0], space.atoms, rows, t, R, False)
-    E, W, d_lean = turning.turns_of(turn, d, rows, t)
+    rows = gauge_transport.turning_rows(space.atoms, (n, 2 * n, t, 2 * k, 0, 0), H)
+    R, turn = gauge_transport.frame_of(x, 0, t), gauge_transport.gauge(x, d, rows, t)
+    L = gauge_transport.leaning(P[rows[0]], rows[0], space.atoms, rows, t, R, False)
+    E, W, d_lean = gauge_transport.turns_of(turn, d, rows, t)
     moved(space.atoms, after, d, turn)
-    turning.carry(space.atoms, after, L, W, d_lean)
+    gauge_transport.carry(space.atoms, after, L, W, d_lean)
     np.testing.assert_allclose(chain(*np.split(after, [n]))[0], chain(*np.split(x, [n]))[0], atol=1e-6)
     then, now = ((generator_plane if plane else generator)(space.atoms, at, 2 * k, t, x[:3]) for at in (x, after))
     A = np.eye(2 * k)
-    R_now = turning.frame_of(after, 0, t)
-    A[:, rows[0]] += turning.displaced(space.atoms, now, then, L, E, d_lean, rows, rows[0], R, R_now, 0)
+    R_now = gauge_transport.frame_of(after, 0, t)
+    A[:, rows[0]] += gauge_transport.displaced(space.atoms, now, then, L, E, d_lean, rows, rows[0], R, R_now, 0)
     np.testing.assert_allclose(jacobian(after) @ A @ N, 0.0, atol=1e-6)
     assert np.abs(jacobian(after) @ N).max() > 0.1

@@ -12,7 +12,7 @@ import pytest
 from kalmark.errors import LogError
 from kalmark.events import Control, Scan
 from kalmark.logs import open_log
-from kalmark.logs.bag.inertial import means
+from kalmark.logs.bag.inertial_messages import means
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")
 

@@ -14,7 +14,7 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Fix, Scan
 from kalmark.geometry import frames3d, rotations
 from kalmark.logs import open_log
-from kalmark.logs.graph import control
+from kalmark.logs.g2o import control
 from kalmark.logs.poses import in_space, read_path, tum_text, write_path
 from kalmark.logs.source import Request, raising
 

@@ -14,7 +14,7 @@ import kalmark as km
 from kalmark.errors import ConfigError, EventError, LogError
 from kalmark.events import Control, Frame
 from kalmark.logs import Log, write_native
-from kalmark.logs.bag.write import Outgoing, header
+from kalmark.logs.bag.mcap_writer import Outgoing, header
 from kalmark.logs.images.tum import published
 from ros_bags import KINDS, write_bag
 

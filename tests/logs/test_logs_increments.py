@@ -13,8 +13,8 @@ import kalmark as km
 from kalmark import Control, Scan
 from kalmark.config.building import build_slam
 from kalmark.config.opening import open_run
-from kalmark.diagnosis.copies import copies
 from kalmark.diagnosis.jumps import Controls
+from kalmark.diagnosis.repeated_events import copies
 from kalmark.errors import EventError
 from kalmark.events import Event
 from kalmark.geometry import frames, frames3d
@@ -22,7 +22,7 @@ from kalmark.logs.increments import CUT, cut, part_of, unevenness
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.overflow import overflows
 from kalmark.models.observe import step, step_of
-from kalmark.slam.motion import noise_of
+from kalmark.slam.held_control import noise_of
 
 PLANE, SPACE, WHEELS = CUT
 WHOLE = {PLANE: [0.4, 0.1, 0.9], SPACE: [0.4, 0.1, -0.2, 0.3, -0.5, 0.7], WHEELS: [2.0, 3.1]}

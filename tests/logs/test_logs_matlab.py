@@ -11,7 +11,7 @@ import pytest
 import scipy.io
 
 from kalmark.errors import LogError
-from kalmark.logs.arrays import arrays, variables
+from kalmark.logs.array_files import arrays, variables
 from kalmark.logs.matlab import HEADER
 
 

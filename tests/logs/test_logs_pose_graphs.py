@@ -15,7 +15,7 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam, open_run
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import wrap
-from kalmark.logs.graph import turned_round
+from kalmark.logs.g2o import turned_round
 from kalmark.results.run import Run
 
 ODOMETRY, LOOP = np.array([0.05, 0.05, 0.02]), np.array([0.03, 0.03, 0.015])

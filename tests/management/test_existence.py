@@ -13,7 +13,7 @@ import pytest
 import kalmark as km
 from kalmark.logs.known_map import read_known
 from kalmark.management import existence
-from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.tracks.looks import CELLS, Looks, cells_of
 from walkers import WALKER, Field, mapped
 

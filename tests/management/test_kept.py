@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 
 WORLD = np.random.default_rng(3).uniform([-2, -3], [22, 3], (40, 2))
 KEEPS = km.Upkeep(confirm=5, within=10, keep_poses=20)

@@ -12,8 +12,8 @@ import kalmark as km
 from kalmark.errors import ModelError
 from kalmark.models.observe import PythonView, linearize, linearize_in_plane, sensor_address, sensor_at, view_of
 from kalmark.models.pointwise import jacobian
-from kalmark.results.calibration import mount_figures
-from kalmark.results.readings import mounts
+from kalmark.results.filter_description import mounts
+from kalmark.results.self_calibration import mount_figures
 
 AT = np.array([0.3, -0.2, 0.4])
 UNKNOWN = {"sigma_scale": 0.1, "sigma_bias_m": 0.3}

@@ -11,7 +11,7 @@ from repeats import SIGMA_M, WORLDS, World, empty, part
 
 import kalmark as km
 from kalmark.geometry.frames import from_frame
-from kalmark.management.repeats import FALSE_ALARMS, displacement, repeats
+from kalmark.management.repeated_places import FALSE_ALARMS, displacement, repeats
 from kalmark.results.run import Run
 
 

@@ -11,8 +11,8 @@ import pytest
 import kalmark as km
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
-from kalmark.models.check import Finding, check_model
 from kalmark.models.landmarks import Point2D
+from kalmark.models.model_check import Finding, check_model
 from kalmark.models.motion import Unicycle
 from kalmark.simulate.robots import diffused
 

@@ -12,11 +12,11 @@ import kalmark as km
 from kalmark.config import build_slam, load_config
 from kalmark.errors import ConfigError, ModelError
 from kalmark.geometry.spaces import SE3, mount_space
-from kalmark.models.check import check_model
 from kalmark.models.landmarks import PointHeight2D
+from kalmark.models.model_check import check_model
 from kalmark.models.observe import PythonView, linearize, view_of
 from kalmark.models.pointwise import jacobian
-from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.landmark_table import MapLandmarks
 
 UNKNOWN = {"scale": 1.07, "bias_m": 0.3, "sigma_scale": 0.1, "sigma_bias_m": 0.3}
 BEACONS = {

@@ -11,8 +11,8 @@ import pytest
 import kalmark as km
 from kalmark.errors import EventError, MapError, ModelError
 from kalmark.geometry.spaces import SE2, SE3
-from kalmark.models.check import check_model
-from kalmark.models.known import known_view
+from kalmark.models.known_view import known_view
+from kalmark.models.model_check import check_model
 from kalmark.models.observe import linearize, sensor_address, sensor_at
 from kalmark.models.protocols import tells_velocity
 from kalmark.models.velocity_view import PythonMovingView, moving_view_of

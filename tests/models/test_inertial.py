@@ -12,8 +12,8 @@ import kalmark as km
 from kalmark.filter.prediction import in_world
 from kalmark.geometry.rotations import exp, matrix, multiply
 from kalmark.geometry.spaces import ROTATION, Space
-from kalmark.models.check import check_model
 from kalmark.models.inertial import inertial_noise, second_integral, second_integral_rate
+from kalmark.models.model_check import check_model
 from kalmark.models.observe import step, step_of
 
 Array = np.ndarray[Any, np.dtype[np.float64]]

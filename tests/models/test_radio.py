@@ -9,7 +9,7 @@ import pytest
 
 import kalmark as km
 from kalmark.geometry.spaces import SE2, SE3, mount_space
-from kalmark.models.check import check_model
+from kalmark.models.model_check import check_model
 from kalmark.models.observe import linearize, view_of
 from kalmark.models.pointwise import jacobian
 

@@ -12,7 +12,7 @@ import kalmark as km
 from differences import derivative
 from kalmark.errors import EventError, ModelError
 from kalmark.geometry.frames import compose
-from kalmark.models.check import check_model
+from kalmark.models.model_check import check_model
 from kalmark.models.observe import expectation, linearize, view_of
 from kalmark.simulate import World, simulate
 

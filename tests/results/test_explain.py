@@ -17,12 +17,12 @@ from kalmark.errors import RunError
 from kalmark.geometry.frames import compose
 from kalmark.report import Candidate
 from kalmark.results.explain import explain
+from kalmark.results.figure_texts import figure
 from kalmark.results.plot_scan import draw_scan
 from kalmark.results.report import change_rows, report_html, series
 from kalmark.results.run import Run
 from kalmark.results.scene import Scene
 from kalmark.results.warnings import window_warnings
-from kalmark.results.words import figure
 
 
 def lost_run(tmp_path: Path) -> Run:

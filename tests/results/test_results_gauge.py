@@ -22,7 +22,7 @@ from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
 from kalmark.results.scene import Scene
-from kalmark.results.verdict import verdict_lines
+from kalmark.results.verdict_text import verdict_lines
 from results_world import circle
 
 START = {2: np.diag([0.5, 0.5, 0.3]) ** 2, 3: np.diag([0.5, 0.5, 0.5, 0.1, 0.1, 0.3]) ** 2}

@@ -12,7 +12,7 @@ from PIL import Image
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.events import Frame
 from kalmark.logs import Log, open_log, write_native
-from kalmark.results.pictures import Pictures
+from kalmark.results.camera_images import Pictures
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run

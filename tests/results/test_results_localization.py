@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.diagnosis.gross import MOST
+from kalmark.diagnosis.gross_mistakes import MOST
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.results.evaluate import headline
 from kalmark.results.run import Run
-from kalmark.results.verdict import verdict_lines
+from kalmark.results.verdict_text import verdict_lines
 from kalmark.results.warnings import autocorrelations
 
 STEPS, DT = 600, 0.1

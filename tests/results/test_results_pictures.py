@@ -20,12 +20,12 @@ from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
 from kalmark.results.evaluate import headline
+from kalmark.results.figure_texts import BATCH, ROBOT, TOTALS, count, figure, header
 from kalmark.results.plot import LANDMARK_COLOUR, draw_map, save_map
 from kalmark.results.record import record
 from kalmark.results.report import POINTS, reasons, report_html, series, show
 from kalmark.results.run import Run
 from kalmark.results.scene import Scene, contours, grouped, stretches_of
-from kalmark.results.words import BATCH, ROBOT, TOTALS, count, figure, header
 from results_world import circle, slam_for
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.config.building import build_slam
-from kalmark.results import foresight
+from kalmark.results import unmeasured
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.run import Run
 from kalmark.results.scene import IN_VIEW, images
@@ -44,8 +44,8 @@ def test_what_is_in_view_is_either_measured_or_kept(run: Run, tmp_path: Path) ->
 
 
 def test_no_more_is_kept_than_the_bounds_allow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(foresight, "SCANS", 5)
-    monkeypatch.setattr(foresight, "LANDMARKS", 2)
+    monkeypatch.setattr(unmeasured, "SCANS", 5)
+    monkeypatch.setattr(unmeasured, "LANDMARKS", 2)
     world = load_world("laser", ["steps=30", "max_per_scan=4"])
     log = simulate(world, 1)
     history = km.record(build_slam(world.config(), log), log, progress=False).history

@@ -16,7 +16,7 @@ from kalmark.geometry.rotations import exp, left_jacobian_inverse, log, multiply
 from kalmark.geometry.spaces import RHO, VECTOR3, Space, retract
 from kalmark.report import LandmarkTable
 from kalmark.results.evaluate import landmark_figures, line_figures
-from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.measures import pose_error, rotation_error, turned_back
 from kalmark.results.record import record
 from kalmark.results.recording import tum

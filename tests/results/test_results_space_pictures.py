@@ -16,7 +16,7 @@ import pytest
 import kalmark as km
 from kalmark.errors import RunError
 from kalmark.results.history import Camera
-from kalmark.results.landmarks import EUCLIDEANS, LINES, OTHERS, shapes
+from kalmark.results.landmark_table import EUCLIDEANS, LINES, OTHERS, shapes
 from kalmark.results.plot import Projection, corners, draw_map, save_map, spacing
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record

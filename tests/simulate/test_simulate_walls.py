@@ -11,8 +11,8 @@ import pytest
 import kalmark as km
 from kalmark.config.building import build_slam
 from kalmark.logs import open_log
-from kalmark.logs.write import write_native
-from kalmark.results.landmarks import MapLandmarks
+from kalmark.logs.native_writer import write_native
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.plot import draw_map
 from kalmark.results.recording import Recording
 from kalmark.simulate import World, simulate

@@ -12,7 +12,7 @@ import pytest
 import kalmark as km
 from kalmark.cli.run import run_log
 from kalmark.config import build_slam
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.results.record import record
 from kalmark.simulate import load_world
 from kalmark.simulate.robots import simulation

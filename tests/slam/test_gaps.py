@@ -13,7 +13,7 @@ from hall import alarmed, hall, mapped, right
 
 import kalmark as km
 from kalmark.association.relocalization import aligned
-from kalmark.batch.course import Chain
+from kalmark.batch.motion_chain import Chain
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.errors import EventError, ModelError
 from kalmark.report import Gap

@@ -10,7 +10,7 @@ import numpy as np
 import kalmark as km
 from kalmark.config.building import build_slam
 from kalmark.simulate import load_world, simulate
-from kalmark.slam.motion import bias_name
+from kalmark.slam.held_control import bias_name
 
 SMALL, STEPS, DT_S = 1e-3, 150, 0.1
 

@@ -11,7 +11,7 @@ import pytest
 import kalmark as km
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.geometry.spaces import HEADING, SCALAR, Space
-from kalmark.results.landmarks import MapLandmarks
+from kalmark.results.landmark_table import MapLandmarks
 
 NAN, INF = float("nan"), float("inf")
 

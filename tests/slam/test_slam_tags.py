@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.batch.batch_state import POSES
 from kalmark.batch.solver import optimum
-from kalmark.batch.state import POSES
 from kalmark.errors import DivergedError, KalmarkError
 from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import from_euler, multiply
-from kalmark.management.tags import AGAIN, settle
+from kalmark.management.ambiguous_tags import AGAIN, settle
 from kalmark.models.imaging import TELLING
 from kalmark.results.batch import tag_problem
 from kalmark.tracks.track import Pending

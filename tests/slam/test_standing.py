@@ -12,7 +12,7 @@ import kalmark as km
 from kalmark.arrays import Array
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import SE2
-from kalmark.slam.standing import Standing
+from kalmark.slam.rests import Standing
 
 STEP_S = 0.1
 BIAS = 0.02

@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.arrays import Array
-from kalmark.slam.surveyed import ELSEWHERE
+from kalmark.slam.surveyed_corrections import ELSEWHERE
 
 PLACES = {1: (3.0, 1.0), 2: (4.0, -2.0), 3: (6.0, 2.0), 4: (2.0, -3.0)}
 WRONG = {3: (5.0, 3.5)}  # where the survey has it

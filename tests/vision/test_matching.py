@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.vision.matching import shift_covariances
+from kalmark.vision.template_matching import shift_covariances
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
 

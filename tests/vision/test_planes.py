@@ -11,8 +11,8 @@ from kalmark.simulate.rendering import Plane as Wall
 from kalmark.simulate.rendering import Renderer, texture
 from kalmark.vision.appearance import View, predicted, taken
 from kalmark.vision.features import Cells
-from kalmark.vision.matching import Searcher
 from kalmark.vision.planes import NUMBERS, Plane, measured, shown
+from kalmark.vision.template_matching import Searcher
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
 

@@ -130,7 +130,7 @@ def test_a_camera_that_was_covered_and_moved_finds_its_place_again(tmp_path: Pat
 
 
 def test_a_landmark_without_a_pixel_has_no_depth() -> None:
-    from kalmark.vision.depths import inverse_depths
+    from kalmark.vision.depth_images import inverse_depths
 
     assert inverse_depths(np.ones((20, 20)), np.zeros((0, 2)), 0.01).shape == (0,)
 

@@ -14,13 +14,13 @@ import kalmark as km
 from kalmark.config import build_slam, open_run
 from kalmark.geometry.frames3d import compose, from_euler_pose, from_frame_many, minus, to_frame_many
 from kalmark.simulate.rendering import Plane, Renderer, texture
-from kalmark.tracks.prospect import Prospect
+from kalmark.tracks.joint_expectation import Prospect
 from kalmark.vision.appearance import predicted, taken
-from kalmark.vision.depths import inverse_depths, with_depths
-from kalmark.vision.matching import Searcher, correlation
+from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane as Surroundings
 from kalmark.vision.selection import Search
+from kalmark.vision.template_matching import Searcher, correlation
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
 

@@ -21,7 +21,7 @@ from kalmark.association.relocalization import aligned, same
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.report import Observation
-from kalmark.tracks.known import Known
+from kalmark.tracks.known_landmarks import Known
 
 FEWEST, FEWEST_NAMED = 3, 2  # pairs without and with ids
 BASES = 8  # pairs of observations from which poses are computed

@@ -7,14 +7,14 @@ from zlib import crc32
 import numpy as np
 
 from kalmark.arrays import Array, Index
-from kalmark.association.extents import apart
 from kalmark.association.matchings import Places
+from kalmark.association.wall_segments import apart
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import P_AT
 from kalmark.filter.local import beside
 from kalmark.filter.map import Marginal, Pairs
-from kalmark.filter.observed import add_blocks, observed_block
+from kalmark.filter.observed_block import add_blocks, observed_block
 from kalmark.geometry.density import NEIGHBOURS, log_density, log_volume_change
 from kalmark.models.observe import linearize
 from kalmark.report import Compared

@@ -1,6 +1,6 @@
 """Turn a log and the associations that a filter made in it into the least-squares problem of the same data.
 
-The log is replayed through the same clock as in the filter (`kalmark.slam.motion`).  Derivation and figures:
+The log is replayed through the same clock as in the filter (`kalmark.slam.held_control`).  Derivation and figures:
 docs/batch.md.
 """
 
@@ -17,10 +17,10 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.course import Chain, Starts
+from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, Ints, State, unsolved
+from kalmark.batch.motion_chain import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
-from kalmark.batch.state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, Ints, State, unsolved
-from kalmark.batch.walls import anchors
+from kalmark.batch.wall_anchors import anchors
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, when
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import mount_space

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.state import ORIGIN, POSE_SPACES, POSES, Ints, State, beyond, looked, plus
+from kalmark.batch.batch_state import ORIGIN, POSE_SPACES, POSES, Ints, State, beyond, looked, plus
 from kalmark.events import Id
 from kalmark.geometry.spaces import POINT2, POINT3, Space
 

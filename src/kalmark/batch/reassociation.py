@@ -21,9 +21,9 @@ from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
 from kalmark.association.gated import assigned
+from kalmark.batch.batch_state import LANDMARKS, Ints, looked
 from kalmark.batch.data import Replay
 from kalmark.batch.solver import Batch, optimum
-from kalmark.batch.state import LANDMARKS, Ints, looked
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.models.observe import inverse_expectation, view_of

@@ -27,8 +27,8 @@ from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
 from kalmark.arrays import Array
+from kalmark.batch.batch_state import LANDMARKS, POSES, Ints, State, unsolved
 from kalmark.batch.problem import Linearized, Problem
-from kalmark.batch.state import LANDMARKS, POSES, Ints, State, unsolved
 from kalmark.errors import KalmarkError
 from kalmark.events import Id
 

@@ -33,12 +33,12 @@ from kalmark.logs.progress import track
 from kalmark.models.observe import composed
 from kalmark.models.protocols import calibrating
 from kalmark.report import Report
-from kalmark.results.landmarks import MapLandmarks, refuse_other_than_points
+from kalmark.results.landmark_table import MapLandmarks, refuse_other_than_points
 from kalmark.results.recording import config_yaml
 from kalmark.results.warnings import NO_ID
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start, told
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
-from kalmark.slam.motion import HeldInput, Part, noise_of
+from kalmark.slam.held_control import HeldInput, Part, noise_of
 from kalmark.slam.robot import Robot
 from kalmark.slam.slam import Slam
 

@@ -19,12 +19,12 @@ from joblib.parallel import get_active_backend
 from threadpoolctl import threadpool_limits
 
 from kalmark.campaign.campaign import Campaign
-from kalmark.campaign.cells import Cell, Scene, open_scene
 from kalmark.campaign.engine import Engine, refusal
-from kalmark.campaign.keeping import Kept, cell_digest
+from kalmark.campaign.finished_runs import Kept, cell_digest
 from kalmark.campaign.replay import Replay
 from kalmark.campaign.scoring import Scores, score
 from kalmark.campaign.sweep import Sweep
+from kalmark.campaign.sweep_cells import Cell, Scene, open_scene
 from kalmark.config.building import build_slam
 from kalmark.config.reading import did_you_mean, validate
 from kalmark.config.schema import Config

@@ -17,8 +17,8 @@ from scipy.special import stdtrit
 from kalmark.arrays import Array
 from kalmark.campaign.campaign import FIGURES, Campaign, kinds, last_value, mean, rms
 from kalmark.campaign.campaign import FILES as RESULTS
-from kalmark.campaign.cells import Cell, shown
 from kalmark.campaign.scoring import Scores
+from kalmark.campaign.sweep_cells import Cell, shown
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.report import show

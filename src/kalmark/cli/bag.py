@@ -30,7 +30,7 @@ def bag(
     from kalmark.files import write
     from kalmark.logs import find_data
     from kalmark.logs.bag.first_config import first_config
-    from kalmark.logs.bag.reading import EXPECTED, find_bag
+    from kalmark.logs.bag.opening import EXPECTED, find_bag
     from kalmark.logs.bag.survey import survey
 
     if out is not None and out.exists():

@@ -20,7 +20,7 @@ def check(
     import numpy as np
 
     from kalmark.declare import line_of
-    from kalmark.models.check import check_model
+    from kalmark.models.model_check import check_model
 
     found = _model(model)
     try:

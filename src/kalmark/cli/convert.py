@@ -85,7 +85,7 @@ def _write_graph(out: Path, source: Path, log: Log | None, run: Run | None) -> N
     """Write a run as a graph.  Raises KalmarkError."""
     from kalmark.config import build_slam, open_run
     from kalmark.files import write
-    from kalmark.results.graph import g2o_text
+    from kalmark.results.pose_graph import g2o_text
 
     if log is None or run is None:
         raise KalmarkError(f"{source}: not the folder of a run, expected one: a graph needs estimates and noise")

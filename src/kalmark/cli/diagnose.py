@@ -25,7 +25,7 @@ def diagnose(
     from kalmark.files import write
     from kalmark.results.plot import save_figure
     from kalmark.results.run import Run
-    from kalmark.results.verdict import verdict_lines
+    from kalmark.results.verdict_text import verdict_lines
 
     with computing():
         loaded = Run.load(run, trust)

@@ -118,7 +118,7 @@ def judge(result: Run) -> None:
 
 def finish(result: Run, out: Path, title: str) -> None:
     """Print a run's figures and warnings, what was left out, and where the run folder is."""
-    from kalmark.results.words import count
+    from kalmark.results.figure_texts import count
 
     print_summary(title, result.summary)
     if result.skipped:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kalmark.errors import KalmarkError, printable
-from kalmark.results.words import (
+from kalmark.results.figure_texts import (
     BATCH,
     DIFFERENCE_COLUMNS,
     DIFFERENCE_TITLE,
@@ -84,8 +84,8 @@ def say(text: str, err: bool = False) -> None:
 
 def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
-    from kalmark.results.calibration import ESTIMATE_COLUMNS, MOUNT_COLUMNS, estimate_rows, mount_rows
-    from kalmark.results.verdict import verdict_lines
+    from kalmark.results.self_calibration import ESTIMATE_COLUMNS, MOUNT_COLUMNS, estimate_rows, mount_rows
+    from kalmark.results.verdict_text import verdict_lines
 
     rows = [
         (label, number(summary[key], unit), unit)

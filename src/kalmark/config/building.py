@@ -18,18 +18,18 @@ from kalmark.config.sections import model_of
 from kalmark.config.tree import EACH
 from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, registered_name
-from kalmark.detect.scan import RAW, Laser
+from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Frame, Scan
 from kalmark.logs import tagslam
-from kalmark.logs.images.pictures import size_of
+from kalmark.logs.images.image_files import size_of
 from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
 from kalmark.logs.log import Log
 from kalmark.models.inertial import Inertial, at_rest
+from kalmark.models.landmark_views import Raised
 from kalmark.models.landmarks import PointHeight2D
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import state_columns
-from kalmark.models.seen import Raised
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 

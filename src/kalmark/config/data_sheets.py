@@ -11,7 +11,7 @@ from kalmark.config.tree import OVERRIDE, Tree, show
 from kalmark.declare import class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import is_number, most
-from kalmark.logs.calibration import INTRINSICS, read_calibration
+from kalmark.logs.camera_calibration import INTRINSICS, read_calibration
 from kalmark.logs.source import mapping
 
 KEY, CALIBRATION = "data_sheet", "calibration"

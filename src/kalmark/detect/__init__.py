@@ -4,11 +4,11 @@ found = km.detect.Trunks(range_max_m=80.0).detect(ranges, angles)      # found.y
 km.Mount(km.sensors.RangeBearing(), detector=km.detect.Trunks(range_max_m=80.0))
 """
 
+from kalmark.detect.apriltags import Tags
 from kalmark.detect.corners import Corners, Walls
 from kalmark.detect.draw import draw_scan
+from kalmark.detect.laser_scan import Detections
 from kalmark.detect.reflectors import Reflectors
-from kalmark.detect.scan import Detections
-from kalmark.detect.tags import Tags
 from kalmark.detect.trunks import Trunks
 
 __all__ = ["Corners", "Detections", "Reflectors", "Tags", "Trunks", "Walls", "draw_scan"]

@@ -15,7 +15,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.declare import Count, NotNegative, Positive, register
-from kalmark.detect.scan import Acute, Detections, Laser
+from kalmark.detect.laser_scan import Acute, Detections, Laser
 from kalmark.geometry.gaussian import gate
 
 STEPS = 10

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.detect.scan import Detections
+from kalmark.detect.laser_scan import Detections
 from kalmark.geometry.frames import inv_scan_many
 from kalmark.geometry.gaussian import ellipse
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import Limit, NotNegative, register
-from kalmark.detect.scan import Detections, Laser
+from kalmark.detect.laser_scan import Detections, Laser
 from kalmark.errors import EventError
 
 

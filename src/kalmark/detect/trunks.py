@@ -18,7 +18,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.declare import Count, Limit, NotNegative, Positive, register
-from kalmark.detect.scan import Detections, Laser
+from kalmark.detect.laser_scan import Detections, Laser
 
 STEPS = 12
 GRAZING = 0.35  # a beam that hits nearer to the edge than this, in radii of depth, is taken to hit there

@@ -15,10 +15,10 @@ from scipy.special import ndtr
 
 from kalmark.arrays import Array
 from kalmark.geometry.gaussian import quantile
+from kalmark.results.figure_texts import figure
 from kalmark.results.history import History, Ints
 from kalmark.results.measures import nees, nis
 from kalmark.results.run import Run
-from kalmark.results.words import figure
 
 BINS = 4
 LEVEL = 0.01  # of false alarms in a whole table

@@ -10,16 +10,16 @@ import numpy as np
 from scipy.stats import norm
 
 from kalmark.arrays import Array
+from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import Given
 from kalmark.batch.problem import sightings
-from kalmark.batch.state import LANDMARKS
 from kalmark.diagnosis import causes
+from kalmark.diagnosis.batch_search import sensors_of
+from kalmark.diagnosis.cause_search import LEAST_GAIN
 from kalmark.diagnosis.causes import MOST_SCALE, Finding
-from kalmark.diagnosis.columns import Column, columns_of, rates_of
-from kalmark.diagnosis.keys import Keys, Path_
+from kalmark.diagnosis.error_columns import Column, columns_of, rates_of
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.search import LEAST_GAIN
-from kalmark.diagnosis.searched import sensors_of
+from kalmark.diagnosis.tunable_keys import Keys, Path_
 from kalmark.models.observe import view_of
 from kalmark.results.run import Run
 

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.special import chdtr, chdtrc, chdtri, expit, ndtr
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.course import START, UNKNOWN
-from kalmark.batch.state import LANDMARKS, Ints
-from kalmark.diagnosis.columns import Column, Where
+from kalmark.batch.batch_state import LANDMARKS, Ints
+from kalmark.batch.motion_chain import START, UNKNOWN
+from kalmark.diagnosis.error_columns import Column, Where
 from kalmark.diagnosis.linear import OUT, Left, Linear
 
 BLOCKS = 40  # stretches of a run, whose scores tell how much a sum of them varies

@@ -18,9 +18,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
+from kalmark.batch.batch_state import State
 from kalmark.batch.data import Given, replayed
 from kalmark.batch.problem import Motions, Problem
-from kalmark.batch.state import State
 from kalmark.diagnosis.causes import BLOCKS
 from kalmark.diagnosis.linear import Left, Linear
 from kalmark.logs.log import Log

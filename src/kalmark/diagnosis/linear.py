@@ -19,9 +19,9 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
+from kalmark.batch.batch_state import LANDMARKS, POSES, Ints, State
 from kalmark.batch.problem import Factor, Linearized, Problem
 from kalmark.batch.solver import Reduced, followers
-from kalmark.batch.state import LANDMARKS, POSES, Ints, State
 
 NONE = -1
 OUT = 1e3  # times its noise: what is so uncertain does not count

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Flags
-from kalmark.diagnosis.gross import FITS, MUCH, WINDOW, fit
+from kalmark.diagnosis.gross_mistakes import FITS, MUCH, WINDOW, fit
 from kalmark.results.checked import DOUBTFUL, UNCHECKED, Sign
-from kalmark.results.gaps import KNOWN
+from kalmark.results.control_gaps import KNOWN
+from kalmark.results.figure_texts import figure
 from kalmark.results.run import Run
-from kalmark.results.words import figure
 from kalmark.slam.alternative import LASTS_S
 from kalmark.slam.replacing import NEEDED
 

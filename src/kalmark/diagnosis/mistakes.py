@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.diagnosis.words import corrected
+from kalmark.diagnosis.cause_texts import corrected
 from kalmark.events import Control, Event, Scan
-from kalmark.logs.corrections import at_time
+from kalmark.logs.log_corrections import at_time
+from kalmark.results.figure_texts import figure
 from kalmark.results.run import Run
-from kalmark.results.words import figure
 from kalmark.slam.robot import Robot
 
 TURNS_DEG = (180, 90, -90)

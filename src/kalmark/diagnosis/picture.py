@@ -6,12 +6,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from kalmark.batch.state import LANDMARKS, POSES
+from kalmark.batch.batch_state import LANDMARKS, POSES
 from kalmark.diagnosis.verdict import Verdict
 from kalmark.results.measures import rigid
 from kalmark.results.plot import ALARM_COLOUR, EUCLIDEAN_COLOUR, LANDMARK_COLOUR, SOFT
 from kalmark.results.run import Run
-from kalmark.results.verdict import verdict_lines
+from kalmark.results.verdict_text import verdict_lines
 from kalmark.results.warnings import autocorrelations, nis_windows
 
 BARS = 8

@@ -18,20 +18,20 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from kalmark.arrays import Array, Flags
+from kalmark.batch.batch_state import LANDMARKS, Ints
 from kalmark.batch.data import replayed
 from kalmark.batch.solver import optimum
-from kalmark.batch.state import LANDMARKS, Ints
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.config.reading import config_of, resolve_config
 from kalmark.config.tree import Tree, read_tree
 from kalmark.diagnosis import causes
+from kalmark.diagnosis.batch_search import NEAR, calibrated, sensors_of
 from kalmark.diagnosis.calibrations import ALPHA, calibrations
+from kalmark.diagnosis.cause_search import LEAST_GAIN
 from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.components import Components, Estimate, Noise
-from kalmark.diagnosis.keys import Keys, Path_, Values
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.search import LEAST_GAIN
-from kalmark.diagnosis.searched import NEAR, calibrated, sensors_of
+from kalmark.diagnosis.tunable_keys import Keys, Path_, Values
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.logs.progress import track

@@ -15,7 +15,7 @@ from kalmark.config.opening import find_log
 from kalmark.config.reading import load_config, resolve_config, shipped_configs
 from kalmark.config.tree import parse_value
 from kalmark.diagnosis.tune import AIMS, Change, Tuning
-from kalmark.results.words import figure
+from kalmark.results.figure_texts import figure
 
 WIDTH = 120
 

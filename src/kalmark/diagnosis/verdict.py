@@ -10,37 +10,37 @@ import numpy as np
 from scipy.special import pdtrc
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.batch.state import LANDMARKS
-from kalmark.diagnosis import copies, sightings
+from kalmark.batch.batch_state import LANDMARKS
+from kalmark.diagnosis import doubled_landmarks, repeated_events
+from kalmark.diagnosis.batch_search import MORE, WORST, Searched, misfits, searched
 from kalmark.diagnosis.blind import blind
+from kalmark.diagnosis.cause_search import LEAST_GAIN, Search
+from kalmark.diagnosis.cause_texts import of_odd_control, words
 from kalmark.diagnosis.causes import JUMPS, Finding
-from kalmark.diagnosis.gross import FITS, LOST, MOVED, fit, gross, started_at
-from kalmark.diagnosis.gross import MISFIT as MISFITS_ALL
-from kalmark.diagnosis.gross import MOST as MOST_D2
+from kalmark.diagnosis.gross_mistakes import FITS, LOST, MOVED, fit, gross, started_at
+from kalmark.diagnosis.gross_mistakes import MISFIT as MISFITS_ALL
+from kalmark.diagnosis.gross_mistakes import MOST as MOST_D2
 from kalmark.diagnosis.jumps import LISTED, Controls, joined
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.lost import ends, lost
 from kalmark.diagnosis.mistakes import LATE, Mistake
-from kalmark.diagnosis.mounts import TURNED
-from kalmark.diagnosis.readings import SIGMA, judged, reasons
-from kalmark.diagnosis.search import LEAST_GAIN, Search
-from kalmark.diagnosis.searched import MORE, WORST, Searched, misfits, searched
-from kalmark.diagnosis.words import of_odd_control, words
+from kalmark.diagnosis.state_readings import SIGMA, judged, reasons
+from kalmark.diagnosis.turned_mounts import TURNED
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.results.batch import filtered_map, of_the_filter_alone
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst
-from kalmark.results.gaps import RULED_OUT, left_out, matters, stayed_lost
+from kalmark.results.control_gaps import RULED_OUT, left_out, matters, stayed_lost
+from kalmark.results.figure_texts import count, figure
 from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import Placed
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
-from kalmark.results.verdict import INNOVATIONS, NO_BATCH, NO_LANDMARKS, NO_MAP
+from kalmark.results.verdict_text import INNOVATIONS, NO_BATCH, NO_LANDMARKS, NO_MAP
 from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, signs, window_warnings, words_of
-from kalmark.results.words import count, figure
 from kalmark.slam.replacing import NEEDED
-from kalmark.slam.surveyed import ELSEWHERE
+from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 from kalmark.tracks.surveys import MISFITS
 
@@ -463,7 +463,7 @@ def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]
 def _copied(run: Run, log: Log) -> list[Cause]:
     """Return the streams of the log that come twice."""
     found = []
-    for robot, sensor, number, of, since_s, noticed in copies.copies(run, log):
+    for robot, sensor, number, of, since_s, noticed in repeated_events.copies(run, log):
         what = f"scans of {robot}.{sensor}" if sensor else f"fixes of {robot}" if noticed else f"controls of {robot}"
         evidence = f"{number} of {of} {what} repeat the one before to the last bit: "
         if noticed:
@@ -543,11 +543,13 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
     """
     h, repeat = run.history, next(iter(run.summary.get("repeats", ())), None)
     stops = [(gap["robot"], gap["start_s"], gap["end_s"] + STOPPED_S) for gap in run.summary.get("gaps", ())]
-    moments = [m for m in sightings.vanished(run) if not any(m.robot == r and a <= m.t_s <= b for r, a, b in stops)]
-    far_m, again = float(np.linalg.norm(repeat["shift_m"])) if repeat else 0.0, list[sightings.Moment]()
-    if repeat and far_m > sightings.spacing(run):
+    moments = [
+        m for m in doubled_landmarks.vanished(run) if not any(m.robot == r and a <= m.t_s <= b for r, a, b in stops)
+    ]
+    far_m, again = float(np.linalg.norm(repeat["shift_m"])) if repeat else 0.0, list[doubled_landmarks.Moment]()
+    if repeat and far_m > doubled_landmarks.spacing(run):
         last = int(np.searchsorted(h.t_ns, round((repeat["start_s"] or 0.0) * 1e9)))
-        again = [moment for moment in moments if last - sightings.NEAR_SCANS <= moment.step <= last]
+        again = [moment for moment in moments if last - doubled_landmarks.NEAR_SCANS <= moment.step <= last]
     first = max(again or moments, key=lambda moment: (moment.score, moment.number), default=None)
     if first is None or not (again or first.score > 0.0):
         return
@@ -564,7 +566,7 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
 
 def split_landmarks(run: Run) -> Iterator[Cause]:
     """Yield that things are in the map twice, side by side: their landmarks are seen in turn, never together."""
-    pairs = sightings.split(run)
+    pairs = doubled_landmarks.split(run)
     if pairs:
         number, mapped = len({pair.name for pair in pairs}), len(run.landmarks)
         first = ", ".join(f"{pair.name} and {pair.other}" for pair in pairs[:LISTED])
@@ -582,7 +584,7 @@ def unseen_landmarks(run: Run) -> Iterator[Cause]:
     Of landmarks that are there a share `FEW` is marked by chance.  Where ids say what was seen, the times are counted
     at which landmarks came into view as before.
     """
-    marks, h, found = run.landmarks, run.history, sightings.unseen(run)
+    marks, h, found = run.landmarks, run.history, doubled_landmarks.unseen(run)
     names = [name for name in marks.ids if name in marks.unseen]
     by_chance = float(pdtrc(len(names) - 1, FEW * len(marks))) > LIKELY if names else True
     if names:
@@ -657,7 +659,7 @@ def effect_of(run: Run, found: Searched) -> Effect:
     same_data = not waited and not of_the_filter_alone(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data
     claimed = float(np.median(ratio)) if comparable else None
-    twice = copies.of_scans(run).any()
+    twice = repeated_events.of_scans(run).any()
     over = 1.0 / claimed if claimed is not None and (claimed < TOO_SURE or twice) else 1.0
     factors = np.hypot(honest[free] / stated[free] * over, shift_m / filtered[free])
     accuracy_m = float(np.median(factors * filtered[free]))

@@ -23,6 +23,19 @@ from numba.extending import overload
 from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter import parallax
+from kalmark.filter.gauge_transport import (
+    carry,
+    displaced,
+    frame_of,
+    gauge,
+    heading_last,
+    is_level,
+    leaning,
+    turning_rows,
+    turns_of,
+    units,
+    widened,
+)
 from kalmark.filter.kernels import (
     RAISED,
     add_square,
@@ -34,7 +47,7 @@ from kalmark.filter.kernels import (
     submatrix,
     transport,
 )
-from kalmark.filter.observed import (
+from kalmark.filter.observed_block import (
     Linear,
     chosen,
     diagonal_blocks,
@@ -53,19 +66,6 @@ from kalmark.filter.observed import (
     within,
 )
 from kalmark.filter.parallax import anchored
-from kalmark.filter.turning import (
-    carry,
-    displaced,
-    frame_of,
-    gauge,
-    heading_last,
-    is_level,
-    leaning,
-    turning_rows,
-    turns_of,
-    units,
-    widened,
-)
 from kalmark.geometry.spaces import Table, generator, generator_plane, retract, retract_plane
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 

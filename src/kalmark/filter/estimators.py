@@ -15,7 +15,7 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import ahead
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
-from kalmark.filter.inertial import has_units, turn_own_errors
+from kalmark.filter.inertial_errors import has_units, turn_own_errors
 from kalmark.filter.map import Map, StochasticMap
 
 __all__ = [

@@ -15,8 +15,8 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import CAPACITY, P_AT, P_SIZE, Layout, Read, State, next_capacity, spaces_of
-from kalmark.filter.nearness import Asked, Nearest, Seen, nearest
-from kalmark.filter.neighbours import Sorts, distances, near_places, paired
+from kalmark.filter.nearest_blocks import Sorts, distances, near_places, paired
+from kalmark.filter.nearest_of_each import Asked, Nearest, Seen, nearest
 from kalmark.filter.prefault import Prefault
 from kalmark.geometry.spaces import Space, Table
 

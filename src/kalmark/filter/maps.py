@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from kalmark.errors import ModelError
-from kalmark.filter.compressed import state as compressed
-from kalmark.filter.compressed.map import CompressedMap
-from kalmark.filter.compressed.state import NUMBERS
+from kalmark.filter.compressed import restoring as compressed
+from kalmark.filter.compressed.compressed_map import CompressedMap
+from kalmark.filter.compressed.restoring import NUMBERS
 from kalmark.filter.compressed.storage import Triangle
 from kalmark.filter.layout import Read, State
 from kalmark.filter.map import Map, StochasticMap

@@ -2,9 +2,9 @@
 
 from kalmark.logs.download import Dataset, cache_folder, fetch, find_data, list_data
 from kalmark.logs.formats import FORMATS, open_log, stream_log
-from kalmark.logs.frames import log_from
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.write import write_native
+from kalmark.logs.memory_tables import log_from
+from kalmark.logs.native_writer import write_native
 
 __all__ = [
     "FORMATS",

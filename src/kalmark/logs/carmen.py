@@ -27,9 +27,9 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.angles import wrap
-from kalmark.logs.columns import BEAM, INCREMENT2
 from kalmark.logs.log import Log
 from kalmark.logs.source import STEP_NS, Format, Request, nanoseconds, number, one_robot, rows
+from kalmark.logs.table_columns import BEAM, INCREMENT2
 
 ROBOT = "robot"
 LASERS = {"FLASER": "front_laser", "RLASER": "rear_laser", "ROBOTLASER1": "front_laser", "ROBOTLASER2": "rear_laser"}

@@ -14,16 +14,15 @@ from kalmark.errors import LogError, one_line
 from kalmark.events import Event, Fix, Scan, order, shown
 from kalmark.logs.bag.importer import BAG
 from kalmark.logs.carmen import CARMEN
-from kalmark.logs.columns import INCREMENT2, INCREMENT3
-from kalmark.logs.corrections import corrected
 from kalmark.logs.download import find_data
-from kalmark.logs.graph import G2O
+from kalmark.logs.g2o import G2O
 from kalmark.logs.images.euroc import EUROC
 from kalmark.logs.images.folder import IMAGES, VIDEO
 from kalmark.logs.images.kitti import KITTI_ODOMETRY
 from kalmark.logs.images.tum import TUM_RGBD
 from kalmark.logs.increments import cut
 from kalmark.logs.log import Log
+from kalmark.logs.log_corrections import corrected
 from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
 from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
 from kalmark.logs.native import NATIVE, stream
@@ -34,6 +33,7 @@ from kalmark.logs.slamtb import SLAMTB
 from kalmark.logs.source import Format, Request, choice, nearest, quantity, raising
 from kalmark.logs.steps import DLR, FREIBURG
 from kalmark.logs.stereo import KITTI_STEREO, STARRY_NIGHT
+from kalmark.logs.table_columns import INCREMENT2, INCREMENT3
 from kalmark.logs.tagslam import TAGSLAM
 from kalmark.logs.victoria_park import VICTORIA_PARK
 
@@ -70,7 +70,7 @@ def open_log(
     `truth` and `fixes` are files of poses in the formats of TUM or KITTI, by robot if there are several: true poses to
     score against, and positions for the filter with the noise `sigma_fixes_m`,
     and `sigma_fixes_z_m` of their heights.
-    `factors` of columns and `shift_s` of sensors correct units, signs and stamps (`kalmark.logs.corrections`).
+    `factors` of columns and `shift_s` of sensors correct units, signs and stamps (`kalmark.logs.log_corrections`).
     With `increments="cut"`, as in a configuration, a scan between the ends of two increments cuts the second.
     With `progress` tables that take longer than two seconds show a bar on standard error.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.

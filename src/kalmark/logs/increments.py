@@ -19,8 +19,8 @@ from kalmark.arrays import Array
 from kalmark.events import Control, Event, Scan, order
 from kalmark.geometry.angles import V, V_inverse
 from kalmark.geometry.rotations import left_jacobian, left_jacobian_inverse
-from kalmark.logs.columns import INCREMENT2, INCREMENT3, WHEELS
 from kalmark.logs.log import Log
+from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, WHEELS
 
 LONG = 5  # usual intervals: a longer one may be of a gap, of which the increment is only the end
 CUT = INCREMENT2, INCREMENT3, WHEELS  # columns of increments that can be cut

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
-from kalmark.logs.arrays import arrays, events_of, find_variables, times
-from kalmark.logs.columns import BEAM
+from kalmark.logs.array_files import arrays, events_of, find_variables, times
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, one_robot, quantity
+from kalmark.logs.table_columns import BEAM
 
 ROBOT, SENSOR, FILE = "robot", "laser", "dataset2.mat"
 COLUMNS = {"range_bearing": BEAM, "bearing": ("bearing_rad",)}

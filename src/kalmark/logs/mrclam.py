@@ -11,9 +11,9 @@ from typing import Any
 
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order, shown
-from kalmark.logs.columns import BEAM
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, nearest, quantity, read_points, rows, timed_rows
+from kalmark.logs.table_columns import BEAM
 
 SENSOR = "camera"
 MRCLAM_ROBOTS = tuple(f"robot{n}" for n in range(1, 6))

@@ -38,12 +38,12 @@ from kalmark.arrays import Array
 from kalmark.declare import classes, is_own
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, in_order, order, shown
-from kalmark.logs.columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
 from kalmark.logs.geodesy import Globe, origin_of
-from kalmark.logs.images.pictures import Album
+from kalmark.logs.images.image_files import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
 from kalmark.logs.table import PARQUET, Refused, Row, Sheet, read_table
+from kalmark.logs.table_columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
 
 RIG = "rig.yaml"
 FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv",

@@ -7,9 +7,9 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control
-from kalmark.logs.columns import WHEELS
 from kalmark.logs.log import Log
 from kalmark.logs.source import seconds
+from kalmark.logs.table_columns import WHEELS
 
 BITS = (16, 32)
 FAR = 100  # times the median of the increments: what is farther is none of a wheel

@@ -15,10 +15,10 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown
-from kalmark.logs.arrays import arrays
-from kalmark.logs.columns import INCREMENT2
+from kalmark.logs.array_files import arrays
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Refuse, Request, nanoseconds, number, one_robot, rows, timed_rows
+from kalmark.logs.table_columns import INCREMENT2
 
 ROBOT, SENSOR = "robot", "radio"
 ODOMETRY, RANGES, TRUTH = "_DR.txt", "_TD.txt", "_.mat"

@@ -20,7 +20,6 @@ from kalmark.errors import LogError
 from kalmark.events import ROUNDED, unit_quaternion
 from kalmark.files import write
 from kalmark.geometry.rotations import matrix
-from kalmark.logs.columns import POSE3
 from kalmark.logs.log import Log, Times, Trajectory
 from kalmark.logs.source import (
     Format,
@@ -34,6 +33,7 @@ from kalmark.logs.source import (
     seconds,
     timed_rows,
 )
+from kalmark.logs.table_columns import POSE3
 
 ROBOT = "robot"
 TUM_CELLS, KITTI_CELLS = 8, 12

@@ -22,9 +22,9 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, order
 from kalmark.files import read_arrays, unpacked
 from kalmark.geometry.gaussian import sigma_probability
-from kalmark.logs.columns import CORNERS, INCREMENT3, TWIST3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, placed
+from kalmark.logs.table_columns import CORNERS, INCREMENT3, TWIST3
 
 NAME = "slamtb"
 CONTROLS = {

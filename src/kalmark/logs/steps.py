@@ -26,7 +26,6 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown
-from kalmark.logs.columns import BEAM, INCREMENT2, POSITION
 from kalmark.logs.log import Log
 from kalmark.logs.source import (
     STEP_NS,
@@ -40,6 +39,7 @@ from kalmark.logs.source import (
     read_points,
     rows,
 )
+from kalmark.logs.table_columns import BEAM, INCREMENT2, POSITION
 
 ROBOT = "robot"
 M = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

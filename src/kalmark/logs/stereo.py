@@ -16,10 +16,10 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.files import read_arrays
-from kalmark.logs.arrays import arrays, events_of, find_variables, refuse_shapes, times
-from kalmark.logs.columns import TWIST3
+from kalmark.logs.array_files import arrays, events_of, find_variables, refuse_shapes, times
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import Format, Request, choice, frame, one_robot, placed, quantity
+from kalmark.logs.table_columns import TWIST3
 
 SENSOR = "stereo"
 PIXELS = ("ul_px", "vl_px", "ur_px", "vr_px")

@@ -24,7 +24,10 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import MOST, Id, bound, most, shown, unit_quaternion
 from kalmark.logs import geodesy
-from kalmark.logs.columns import (
+from kalmark.logs.geodesy import Globe
+from kalmark.logs.progress import track
+from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
+from kalmark.logs.table_columns import (
     CANONICAL,
     DIRECTIONS,
     FACTORS,
@@ -36,9 +39,6 @@ from kalmark.logs.columns import (
     UNITS,
     WHEELS,
 )
-from kalmark.logs.geodesy import Globe
-from kalmark.logs.progress import track
-from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
 
 T = TypeVar("T")
 TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}

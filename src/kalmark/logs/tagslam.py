@@ -20,9 +20,8 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.rotations import matrix
-from kalmark.logs.bag.reading import Bag, stamp
-from kalmark.logs.calibration import lens
-from kalmark.logs.columns import CORNERS, INCREMENT3
+from kalmark.logs.bag.opening import Bag, stamp
+from kalmark.logs.camera_calibration import lens
 from kalmark.logs.known_map import TAG, KnownLandmark
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
@@ -37,6 +36,7 @@ from kalmark.logs.source import (
     quantity,
     vector_frame,
 )
+from kalmark.logs.table_columns import CORNERS, INCREMENT3
 
 ROBOT = "rig"
 FILES = ("tagslam.yaml", "cameras.yaml", "camera_poses.yaml", "tag_detections.bag", "tag_detections.bag.bz2")

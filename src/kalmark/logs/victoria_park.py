@@ -16,10 +16,10 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.files import refuse_bomb
-from kalmark.logs.arrays import arrays, times
-from kalmark.logs.columns import BEAM
+from kalmark.logs.array_files import arrays, times
 from kalmark.logs.log import Log, PositionTrack, Times
 from kalmark.logs.source import Format, Request, choice, folder_of, nanoseconds, one_robot, read_text, timed_rows
+from kalmark.logs.table_columns import BEAM
 
 ROBOT, SENSOR = "car", "laser"
 ASCII_ZIP, ASCII_DR, MAT_DR, GPS = "victoria_park_ascii.zip", "DRS.txt", "aa3_dr.mat", "aa3_gpsx.mat"

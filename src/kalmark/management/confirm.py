@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.association.extents import apart
 from kalmark.association.gated import assigned
 from kalmark.association.posterior import WELL_KNOWN
 from kalmark.association.protocol import Association, new_gate
 from kalmark.association.query import log_volume_ratio
+from kalmark.association.wall_segments import apart
 from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.map import Map

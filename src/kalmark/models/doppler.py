@@ -18,7 +18,7 @@ from kalmark.compiled import compiled
 from kalmark.declare import Limit, NotNegative, Positive, declared, register
 from kalmark.geometry.directions import inv_spherical_many, spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
-from kalmark.models.seen import Expecting, refuse_negative_ranges, residual
+from kalmark.models.landmark_views import Expecting, refuse_negative_ranges, residual
 
 __all__ = ["Radar2D", "Radar3D", "RangeRate2D", "RangeRate3D"]
 

@@ -10,8 +10,8 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.declare import NotNegative, Number, Positive, Within, declared, register
 from kalmark.errors import EventError
-from kalmark.models import cameras, lines, seen, tags
-from kalmark.models.seen import Spatial, constant
+from kalmark.models import cameras, landmark_views, lines, tags
+from kalmark.models.landmark_views import Spatial, constant
 
 __all__ = ["Omnidirectional", "PinHole", "PixelDepth", "Segments", "Stereo", "TagCorners"]
 
@@ -33,7 +33,7 @@ class _Camera(Spatial):
 
     columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_px",) * 2
-    expected: ClassVar[Any] = seen.camera
+    expected: ClassVar[Any] = landmark_views.camera
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3", "inverse_depth", "anchored_homogeneous", "homogeneous")
     finds_depth: ClassVar[bool] = False
 
@@ -130,7 +130,7 @@ class PixelDepth(_Lens):
 
     sigma_rho_per_m: Annotated[Positive, "Noise of the inverse depth: that of a depth z is sigma_rho z^2."] = 0.003
 
-    expected: ClassVar[Any] = seen.pixel_depth
+    expected: ClassVar[Any] = landmark_views.pixel_depth
     columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px", "rho_per_m")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_px", "sigma_px", "sigma_rho_per_m")
     finds_depth: ClassVar[bool] = True
@@ -199,7 +199,7 @@ class Stereo(_PinHole):
     sigma_ur_px: Annotated[Positive, "Noise of the right u."] = 1.0
     sigma_vr_px: Annotated[Positive, "Noise of the right v."] = 1.0
 
-    expected: ClassVar[Any] = seen.stereo
+    expected: ClassVar[Any] = landmark_views.stereo
     of_pair: ClassVar[bool] = True
     columns: ClassVar[tuple[str, ...]] = ("ul_px", "vl_px", "ur_px", "vr_px")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_ul_px", "sigma_vl_px", "sigma_ur_px", "sigma_vr_px")
@@ -242,7 +242,7 @@ class Segments(_PinHole):
     sigma_px: Annotated[Positive, "Noise of each pixel coordinate of an end."] = 1.0
     min_length_px: Annotated[NotNegative, "Shortest segment that counts as seen."] = 20.0
 
-    expected: ClassVar[Any] = seen.segment
+    expected: ClassVar[Any] = landmark_views.segment
     columns: ClassVar[tuple[str, ...]] = ("u1_px", "v1_px", "u2_px", "v2_px")
     sees_kinds: ClassVar[tuple[str, ...]] = (
         "pluecker_line", "anchored_pluecker_line", "inverse_depth_line", "anchored_homogeneous_line",
@@ -289,7 +289,7 @@ class TagCorners(_Lens):
     Corners in the tag's frame: (-s, -s), (s, -s), (s, s), (-s, s), s half the size.
     """
 
-    expected: ClassVar[Any] = seen.tag_corners
+    expected: ClassVar[Any] = landmark_views.tag_corners
     cov_size: ClassVar[int] = 8
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_px",) * 8
     columns: ClassVar[tuple[str, ...]] = (

@@ -16,7 +16,7 @@ from kalmark.declare import NotNegative, Number, built_in, declared, register
 from kalmark.geometry import spaces
 from kalmark.geometry.directions import unit_many
 from kalmark.geometry.spaces import SE3, Space
-from kalmark.models import landmarks2d, landmarks3d, lines, seen, tags, walls
+from kalmark.models import landmark_views, landmarks2d, landmarks3d, lines, tags, walls
 
 __all__ = [
     "BUILT_IN", "LINES", "AnchoredHomogeneous", "AnchoredHomogeneousLine", "AnchoredPlueckerLine", "AsPoint",
@@ -240,7 +240,7 @@ class InverseDepth3D(_BecomesPoint):
 
     kind: ClassVar[str] = "inverse_depth"
     space: ClassVar[Space] = Space("inverse_depth", (spaces.ANCHOR, spaces.DIRECTION, spaces.RHO))
-    look: ClassVar[Any] = staticmethod(seen.inverse_depth)
+    look: ClassVar[Any] = staticmethod(landmark_views.inverse_depth)
     of: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_from_view)
     point: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_to_point)
     look_at_point: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_as_point)
@@ -256,7 +256,7 @@ class AnchoredHomogeneous(_BecomesPoint):
 
     kind: ClassVar[str] = "anchored_homogeneous"
     space: ClassVar[Space] = Space("anchored_homogeneous", (spaces.ANCHOR, spaces.VECTOR3, spaces.RHO))
-    look: ClassVar[Any] = staticmethod(seen.anchored)
+    look: ClassVar[Any] = staticmethod(landmark_views.anchored)
     of: ClassVar[Any] = staticmethod(landmarks3d.anchored_from_view)
     point: ClassVar[Any] = staticmethod(landmarks3d.anchored_to_point)
     look_at_point: ClassVar[Any] = staticmethod(landmarks3d.anchored_as_point)
@@ -272,7 +272,7 @@ class Homogeneous(_Depth):
 
     kind: ClassVar[str] = "homogeneous"
     space: ClassVar[Space] = Space("homogeneous", (spaces.HOMOGENEOUS,))
-    look: ClassVar[Any] = staticmethod(seen.homogeneous)
+    look: ClassVar[Any] = staticmethod(landmark_views.homogeneous)
     of: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_from_view)
     point: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_to_point)
     look_at_point: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_as_point)

@@ -24,7 +24,8 @@ from kalmark.declare import built_in
 from kalmark.geometry import frames3d
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
-from kalmark.models import landmarks, seen, sensors
+from kalmark.models import landmark_views, landmarks, sensors
+from kalmark.models.landmark_views import EXPECT, LOOK, VARY, residual
 from kalmark.models.landmarks3d import chained
 from kalmark.models.protocols import (
     Completing,
@@ -35,7 +36,6 @@ from kalmark.models.protocols import (
     finds_depth,
     parameter_covariance,
 )
-from kalmark.models.seen import EXPECT, LOOK, VARY, residual
 
 View = tuple[int, int, int, int, Array, Array, Flags, int]
 # addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles;
@@ -125,7 +125,9 @@ class PythonView:
 
 def fix_view(antenna: Array) -> View:
     """Return the view of an absolute position fix whose antenna sits at `antenna` (3,) or (7,) in the robot's frame."""
-    return built_in_view(seen.oneself, seen.position, 0, antenna, NOTHING.copy(), np.zeros(3, dtype=np.bool_))
+    return built_in_view(
+        landmark_views.oneself, landmark_views.position, 0, antenna, NOTHING.copy(), np.zeros(3, dtype=np.bool_)
+    )
 
 
 def built_in_view(
@@ -310,8 +312,8 @@ def _linearized(
         par = par.copy()
         for i in range(len(head) - 2 * pose):
             par[i] = head[2 * pose + i]
-    v, V_T, V_l = seen.look(look_at, (T, l))
-    e, z, E_v = seen.expect(expect_at, (code, par, angular, v, y))
+    v, V_T, V_l = landmark_views.look(look_at, (T, l))
+    e, z, E_v = landmark_views.expect(expect_at, (code, par, angular, v, y))
     E_T, E_l = chained(E_v, V_T), chained(E_v, V_l)
     if len(head) == pose:
         return e, z, turned(E_T, T_r), E_l
@@ -328,7 +330,7 @@ def _linearized(
             for c in range(n):
                 E_h[i, a, c] = E_T[i, a, c]
     if len(head) > 2 * pose:
-        beside(E_h, seen.vary(vary_at, (code, par, angular, v, e)))
+        beside(E_h, landmark_views.vary(vary_at, (code, par, angular, v, e)))
     return e, z, E_h, E_l
 
 

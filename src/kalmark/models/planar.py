@@ -16,8 +16,8 @@ from kalmark.compiled import compiled
 from kalmark.declare import Estimated, Limit, NotNegative, Number, Positive, declared, refuse, register
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
-from kalmark.models import seen
-from kalmark.models.seen import Cone, Distancing, Expecting, Raised, raised, refuse_negative_ranges
+from kalmark.models import landmark_views
+from kalmark.models.landmark_views import Cone, Distancing, Expecting, Raised, raised, refuse_negative_ranges
 
 __all__ = ["Bearing", "Position2D", "Range", "Range3D", "RangeBearing", "RangeBearingSignature"]
 
@@ -57,7 +57,7 @@ def in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple
             e[i, 0] = (e[i, 0] + par[1]) / par[0]
             for j in range(E_v.shape[2]):
                 E_v[i, 0, j] /= par[0]
-    return e, seen.residual(y, e, angular), E_v
+    return e, landmark_views.residual(y, e, angular), E_v
 
 
 @compiled
@@ -186,11 +186,11 @@ class _RangingBearing(_Ranging, _Planar):
 
     def points(self, y: Array) -> tuple[Array, Array]:
         """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
-        seen = y[:, :2].copy()
+        measured = y[:, :2].copy()
         if self.scale == 1.0 and self.bias_m == 0.0:
-            return inv_scan_many(seen)
-        seen[:, 0] = self.distances(y)
-        p, P_y = inv_scan_many(seen)
+            return inv_scan_many(measured)
+        measured[:, 0] = self.distances(y)
+        p, P_y = inv_scan_many(measured)
         P_y[:, :, 0] /= self.scale
         return p, P_y
 

@@ -16,7 +16,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, Limit, Number, Positive, declared, register
-from kalmark.models.seen import Distancing, Raised, raised
+from kalmark.models.landmark_views import Distancing, Raised, raised
 
 __all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
 

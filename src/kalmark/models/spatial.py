@@ -13,8 +13,8 @@ from kalmark.declare import Limit, NotNegative, Positive, register
 from kalmark.errors import EventError
 from kalmark.events import unit_quaternion
 from kalmark.geometry.directions import inv_spherical_many
-from kalmark.models import seen, walls
-from kalmark.models.seen import Cone, Spatial, refuse_negative_ranges
+from kalmark.models import landmark_views, walls
+from kalmark.models.landmark_views import Cone, Spatial, refuse_negative_ranges
 
 __all__ = ["Position3D", "RangeBearing3D", "TagPose", "Wall"]
 
@@ -72,7 +72,7 @@ class RangeBearing3D(Cone, Spatial):
     sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
     sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
 
-    expected: ClassVar[Any] = seen.range_bearing
+    expected: ClassVar[Any] = landmark_views.range_bearing
     columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad")
 
@@ -93,7 +93,7 @@ class Position3D(Cone, Spatial):
     sigma_y_m: Annotated[Positive, "Noise, along y."] = 0.1
     sigma_z_m: Annotated[Positive, "Noise, along z."] = 0.1
 
-    expected: ClassVar[Any] = seen.position
+    expected: ClassVar[Any] = landmark_views.position
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 
@@ -112,7 +112,7 @@ class TagPose(Spatial):
     sigma_position_m: Annotated[Positive, "Noise of each coordinate."] = 0.02
     sigma_rotation_rad: Annotated[Positive, "Noise of the rotation about each axis."] = 0.02
 
-    expected: ClassVar[Any] = seen.tag_pose
+    expected: ClassVar[Any] = landmark_views.tag_pose
     cov_size: ClassVar[int] = 6
     columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
     sigmas: ClassVar[tuple[str, ...]] = (*3 * ("sigma_position_m",), *3 * ("sigma_rotation_rad",))

@@ -19,9 +19,9 @@ from kalmark.compiled import compiled
 from kalmark.declare import NotNegative, Number, Positive, Probability, Within, declared, refuse, register
 from kalmark.events import unit_quaternion
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
-from kalmark.models import seen
+from kalmark.models import landmark_views
+from kalmark.models.landmark_views import Sensing, residual
 from kalmark.models.protocols import CHANGE, POSE, TWIST
-from kalmark.models.seen import Sensing, residual
 
 __all__ = [
     "AbsolutePose2D", "AbsolutePose3D", "BodyVelocity2D", "BodyVelocity3D", "Gps2D", "Gps3D", "Gravity", "GroundSpeed",
@@ -367,7 +367,7 @@ class AbsolutePose3D(StateSensor):
     sigmas: ClassVar[tuple[str, ...]] = (*("sigma_m",) * 3, *("sigma_rotation_rad",) * 3)
     cov_size: ClassVar[int] = 6
     views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = seen.tag_pose
+    expected: ClassVar[Any] = landmark_views.tag_pose
 
     def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
         """Return the poses v (K, 7) themselves, and how the innovations of y (K, 7) change with them (K, 6, 6)."""

@@ -32,10 +32,10 @@ from kalmark.declare import built_in
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.rotations import left_jacobian_inverse, left_jacobian_rate, log, matrix, skew
-from kalmark.models import seen
+from kalmark.models import landmark_views
+from kalmark.models.landmark_views import EXPECT, VARY, residual
 from kalmark.models.observe import LINEARIZE, VELOCITY, View, call_velocity
 from kalmark.models.protocols import CHANGE, POSE, TWIST, HasVelocity, HoldsRate, OfState, sees_rates, velocity_in
-from kalmark.models.seen import EXPECT, VARY, residual
 
 # of robot, mount, second block, seconds since the last reading and control, address of a VELOCITY: v, V_r, V_s, V_l
 CHAIN = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8[::1], i8)")
@@ -173,7 +173,7 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
     since = y[0, m if velocity != 0 else y.shape[1] - 1 :].copy()
     v, V_r, V_s, V_l = call_chain(chain_at, (head[:pose].copy(), mount, l[0].copy(), since, velocity))
     row, e = v.reshape((1, len(v))), y.copy()
-    expected, z, E_v = seen.expect(expect_at, (0, par, angular, row, y[:, :m].copy()))
+    expected, z, E_v = landmark_views.expect(expect_at, (0, par, angular, row, y[:, :m].copy()))
     e[:, :m] = expected
     p, n = z.shape[1], V_r.shape[1]
     E_h = np.zeros((1, p, n if len(head) == pose else 2 * n + len(head) - 2 * pose))
@@ -182,7 +182,7 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
         E_h[0, :, n : 2 * n] = E_v[0] @ V_s
     if len(head) > 2 * pose:
         usual = y[:, m : 2 * m].copy() if velocity == 0 and y.shape[1] > m + 1 else expected
-        E_h[0, :, 2 * n :] = seen.vary(vary_at, (0, par, angular, row, usual))[0]
+        E_h[0, :, 2 * n :] = landmark_views.vary(vary_at, (0, par, angular, row, usual))[0]
     E_l = np.zeros((1, p, V_l.shape[1]))
     if V_l.shape[1] > 0:
         E_l[0] = E_v[0] @ V_l

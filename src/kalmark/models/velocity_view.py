@@ -20,11 +20,11 @@ from kalmark.compiled import address_of, compiled
 from kalmark.declare import built_in
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
-from kalmark.models import seen
+from kalmark.models import landmark_views
+from kalmark.models.landmark_views import EXPECT, LOOK, residual
 from kalmark.models.landmarks3d import chained
 from kalmark.models.observe import LINEARIZE, VELOCITY, View, composed, is_built_in
 from kalmark.models.protocols import TWIST, Landmark, Sensor, tells_velocity, velocity_in
-from kalmark.models.seen import EXPECT, LOOK, residual
 from kalmark.models.state_view import CHAIN, CHAINS, call_chain, carried_in_plane, carried_in_space
 
 MARK = 1.0  # behind a mount: the second block of the head is no mount
@@ -43,13 +43,13 @@ def linearize_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array
     at, r = marked[:pose].copy(), head[:pose].copy()
     t, t_r, _t_s, t_x = call_chain(chain_at, (r, at, head[pose:].copy(), since, velocity))
     T, T_r = placed(r, at)
-    p, P_T, P_l = seen.look(look_at, (T, l))
+    p, P_T, P_l = landmark_views.look(look_at, (T, l))
     k, d, n, m = p.shape[0], p.shape[1], T_r.shape[0], y.shape[1]
     v = np.empty((k, 2 * d))
     for i in range(k):
         for a in range(d):
             v[i, a], v[i, d + a] = p[i, a], t[a]
-    e, z, E_v = seen.expect(expect_at, (0, since, angular, v, y))
+    e, z, E_v = landmark_views.expect(expect_at, (0, since, angular, v, y))
     E_p, E_h = E_v[:, :, :d].copy(), np.zeros((k, m, n + t_x.shape[1]))
     E_T, E_l = chained(E_p, P_T), chained(E_p, P_l)
     for i in range(k):

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
+from kalmark.batch.batch_state import LANDMARKS, POSES, State
 from kalmark.batch.data import Associations, Given, Known, Replay, replayed
 from kalmark.batch.problem import Problem
 from kalmark.batch.reassociation import ROUNDS, Reassociated, reassociated
 from kalmark.batch.solver import Batch, optimum
-from kalmark.batch.state import LANDMARKS, POSES, State
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
@@ -28,10 +28,10 @@ from kalmark.models.protocols import Landmark, OfState, SeesVelocity
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.history import History, Start, as_id
-from kalmark.results.landmarks import refuse_other_than_points
+from kalmark.results.landmark_table import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
 from kalmark.results.restarts import Restart, restarts
-from kalmark.slam.surveyed import ELSEWHERE
+from kalmark.slam.surveyed_corrections import ELSEWHERE
 
 MOST_REJECTED = 0.2  # of the fixes
 STRETCHES = 10  # of a robot's path, each with its difference from the batch solution

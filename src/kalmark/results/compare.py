@@ -15,12 +15,12 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import shown
 from kalmark.results.evaluate import summary_of
+from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, figure, header
 from kalmark.results.history import Ints
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.plot import draw_plan, legend
 from kalmark.results.recording import Recording
 from kalmark.results.scene import COLOURS, INK, Scene
-from kalmark.results.words import BATCH, MORE, ROBOT, TOTALS, figure, header
 
 DRAWN = 6  # maps in the picture at most; the curves are of all runs
 PANEL, CURVES = 5.0, 2.6  # inches: a map, the curves

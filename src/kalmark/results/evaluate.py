@@ -12,11 +12,11 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.logs.source import records_of
 from kalmark.report import OUTCOMES
-from kalmark.results.calibration import bias_figures, mount_figures
-from kalmark.results.gaps import gap_figures, gap_notes
+from kalmark.results.association_errors import association_figures, best_known, by_position, no_ids
+from kalmark.results.control_gaps import gap_figures, gap_notes
+from kalmark.results.figure_texts import count, figure
 from kalmark.results.history import History, Ints
-from kalmark.results.landmarks import EUCLIDEAN, MapLandmarks
-from kalmark.results.matching import association_figures, best_known, by_position, no_ids
+from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks
 from kalmark.results.measures import (
     Rigid,
     diverged,
@@ -32,11 +32,11 @@ from kalmark.results.measures import (
     similarity,
 )
 from kalmark.results.recording import Recording
-from kalmark.results.repeats import repeat_figures, repeat_notes
+from kalmark.results.repeated_landmarks import repeat_figures, repeat_notes
 from kalmark.results.restarts import restarts
+from kalmark.results.self_calibration import bias_figures, mount_figures
 from kalmark.results.truth import Truth, fitted
 from kalmark.results.warnings import advice, fix_nis_per_dof, warnings, window_figures
-from kalmark.results.words import count, figure
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0

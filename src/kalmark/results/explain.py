@@ -16,12 +16,12 @@ from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.logs.source import seconds
 from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth
 from kalmark.report import Candidate
+from kalmark.results.figure_texts import count, figure
+from kalmark.results.filter_description import mount_now
 from kalmark.results.history import Change, History, Ints
-from kalmark.results.landmarks import LINE
-from kalmark.results.readings import mount_now
+from kalmark.results.landmark_table import LINE
 from kalmark.results.recording import Recording
 from kalmark.results.truth import as_rigid
-from kalmark.results.words import count, figure
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam

@@ -99,7 +99,7 @@ class MapSnapshot(NamedTuple):
     """The landmarks of the map after step `step`: ids, places (K, n) and their covariances (K, q, q), kinds.
 
     In the plane places are positions.  In space they are positions, endpoints of lines or poses of tags, padded with
-    NaN (see `kalmark.results.landmarks`).  `shape` (K, q, q) are the
+    NaN (see `kalmark.results.landmark_table`).  `shape` (K, q, q) are the
     covariances without the motion of the world in common (`kalmark.results.gauge`), `robots` (R, d, d) those of the
     robots' positions, in the order of their starts.
     """
@@ -203,9 +203,9 @@ class History:
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
     NaN where robots or sensors differ in size.  `late` (O,) says which tentative ones were fused when their landmark
     was confirmed.  `left_px` (O,) is what the corners of tags are off by after the scan
-    (`kalmark.results.readings.left_px`).  `noise` (O, p) are the sigmas stated of z, NaN where they are not of its
-    numbers.  `seen_at` (O, d) is where each observation without an id seemed to come from before the scan, NaN where
-    its sensor does not tell.
+    (`kalmark.results.filter_description.left_px`).  `noise` (O, p) are the sigmas stated of z, NaN where they are
+    not of its numbers.  `seen_at` (O, d) is where each observation without an id seemed to come from before the
+    scan, NaN where its sensor does not tell.
 
     Observations `candidate_row` (C,) were compared with landmarks, `candidate_landmark` (C,), of distance
     `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks

@@ -17,7 +17,7 @@ from typing import Any, Protocol, TextIO
 
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Event, kind_of, seconds, shown, when
-from kalmark.logs.lines import LONGEST_LINE, event_of, mapping_of
+from kalmark.logs.json_lines import LONGEST_LINE, event_of, mapping_of
 from kalmark.report import Report
 from kalmark.slam.slam import Slam
 

@@ -12,9 +12,9 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.geometry.rotations import from_euler, matrix
 from kalmark.logs.bag import tables, view
-from kalmark.logs.bag.write import Outgoing, header, write_mcap
+from kalmark.logs.bag.mcap_writer import Outgoing, header, write_mcap
 from kalmark.results.history import MapSnapshot
-from kalmark.results.landmarks import shapes
+from kalmark.results.landmark_table import shapes
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log

@@ -22,10 +22,10 @@ from matplotlib.transforms import Affine2D
 from kalmark.arrays import Array
 from kalmark.files import replace_file
 from kalmark.results.evaluate import headline, summary_of
-from kalmark.results.landmarks import LINES, TAG
+from kalmark.results.landmark_table import LINES, TAG
 from kalmark.results.recording import Recording
 from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares
-from kalmark.results.verdict import alarm
+from kalmark.results.verdict_text import alarm
 
 VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "front": (0.0, 0.0)}
 LANDMARK_COLOUR = "#d2691e"

@@ -16,13 +16,13 @@ from matplotlib.lines import Line2D
 
 from kalmark.arrays import Array
 from kalmark.errors import RunError
+from kalmark.results.camera_images import Pictures
 from kalmark.results.explain import Explanation, Fate
+from kalmark.results.figure_texts import figure as figure_of
 from kalmark.results.history import Camera, Measuring
-from kalmark.results.pictures import Pictures
 from kalmark.results.plot_measured import draw_measured, measuring
 from kalmark.results.recording import Recording
 from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
-from kalmark.results.words import figure as figure_of
 
 OUTCOME = {
     "associated": "#4a8f7b", "new": "#d2a23c", "rejected": "#c8553d", "ignored": "#8b929c",

@@ -18,8 +18,8 @@ from kalmark.logs.log import Log, begins_at
 from kalmark.logs.progress import track
 from kalmark.logs.source import nearest
 from kalmark.report import Report
-from kalmark.results.foresight import Foresight
-from kalmark.results.gaps import joined
+from kalmark.results.control_gaps import joined
+from kalmark.results.filter_description import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
 from kalmark.results.history import (
     Change,
     Controlled,
@@ -32,13 +32,13 @@ from kalmark.results.history import (
     padded,
     texts,
 )
-from kalmark.results.landmarks import MapLandmarks
-from kalmark.results.readings import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.recording import LogReference
-from kalmark.results.repeats import repeated
+from kalmark.results.repeated_landmarks import repeated
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
-from kalmark.slam.motion import HeldInput
+from kalmark.results.unmeasured import Foresight
+from kalmark.slam.held_control import HeldInput
 
 if TYPE_CHECKING:
     from kalmark.report import Gap

@@ -30,9 +30,9 @@ from kalmark.events import listed, shown
 from kalmark.files import locked, read_arrays, refuse_aliases, replace_file, write
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of, seconds
+from kalmark.results.filter_description import plain
 from kalmark.results.history import History
-from kalmark.results.landmarks import MapLandmarks
-from kalmark.results.readings import plain
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.truth import Truth
 
 if TYPE_CHECKING:

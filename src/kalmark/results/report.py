@@ -19,12 +19,22 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.report import OUTCOMES
-from kalmark.results.calibration import MOUNT_COLUMNS, mount_rows
+from kalmark.results.camera_images import Pictures
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.explain import Explanation, Fate, explained
+from kalmark.results.figure_texts import (
+    BATCH,
+    DIFFERENCE_COLUMNS,
+    DIFFERENCE_TITLE,
+    MORE,
+    ROBOT,
+    TOTALS,
+    difference_rows,
+    header,
+    in_words,
+)
 from kalmark.results.history import Camera, Change, History, Ints, MapSnapshot
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
-from kalmark.results.pictures import Pictures
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
     POINTS,
@@ -41,18 +51,8 @@ from kalmark.results.scene import (
     stretches_of,
     thin,
 )
-from kalmark.results.verdict import overall, verdict_lines
-from kalmark.results.words import (
-    BATCH,
-    DIFFERENCE_COLUMNS,
-    DIFFERENCE_TITLE,
-    MORE,
-    ROBOT,
-    TOTALS,
-    difference_rows,
-    header,
-    in_words,
-)
+from kalmark.results.self_calibration import MOUNT_COLUMNS, mount_rows
+from kalmark.results.verdict_text import overall, verdict_lines
 
 NOT_FIGURES = ("robots", "warnings", "advice", "notes", "gaps", "repeats", "verdict")
 BINS = 120

@@ -21,10 +21,10 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
+from kalmark.results.control_gaps import while_lost
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
-from kalmark.results.gaps import while_lost
 from kalmark.results.history import Camera, History, Ints, MapSnapshot, Measuring
-from kalmark.results.landmarks import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
+from kalmark.results.landmark_table import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
 from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording
 from kalmark.results.truth import as_rigid, moved

@@ -14,7 +14,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.logs.log import Log, PositionTrack
 from kalmark.results.history import Arrays, History, Named, Start, as_id, padded_all, texts
-from kalmark.results.landmarks import TAG
+from kalmark.results.landmark_table import TAG
 from kalmark.results.measures import Rigid, pose_error
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}

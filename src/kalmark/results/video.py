@@ -17,8 +17,8 @@ from PIL import Image
 from kalmark.errors import RunError
 from kalmark.files import replace_file
 from kalmark.logs.progress import track
+from kalmark.results.camera_images import Pictures
 from kalmark.results.evaluate import headline
-from kalmark.results.pictures import Pictures
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_scan import draw_image
 from kalmark.results.recording import Recording

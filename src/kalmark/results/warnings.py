@@ -28,16 +28,16 @@ from kalmark.declare import registered_name
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry.gaussian import gate, quantile
 from kalmark.models import sensors
-from kalmark.results.calibration import mount_warnings
+from kalmark.results.association_errors import LEAST, no_ids
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
-from kalmark.results.gaps import gap_warnings
+from kalmark.results.control_gaps import gap_warnings
+from kalmark.results.figure_texts import count, figure
 from kalmark.results.history import History, Ints, Placed, UsedFix
-from kalmark.results.matching import LEAST, no_ids
 from kalmark.results.measures import cut_off, nis
 from kalmark.results.recording import Recording
-from kalmark.results.repeats import repeat_warnings
+from kalmark.results.repeated_landmarks import repeat_warnings
 from kalmark.results.restarts import restarts
-from kalmark.results.words import count, figure
+from kalmark.results.self_calibration import mount_warnings
 from kalmark.slam.held_readings import AGAIN
 
 DEGREES = 100  # of freedom in a window, at least

@@ -9,7 +9,7 @@ from numpy.random import Generator
 
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
-from kalmark.detect.scan import Laser
+from kalmark.detect.laser_scan import Laser
 from kalmark.simulate.sights import SEGMENTS, Sensing, Things
 
 

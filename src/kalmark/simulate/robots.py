@@ -20,7 +20,7 @@ from numpy.random import Generator, SeedSequence
 
 from kalmark.arrays import Array
 from kalmark.config.building import build_robot
-from kalmark.detect.scan import RAW, Laser
+from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.events import Control, Event, Frame, Id, Scan, order, seconds
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix

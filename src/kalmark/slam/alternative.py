@@ -17,7 +17,7 @@ from scipy.linalg import solve
 from kalmark.arrays import Array
 from kalmark.filter.estimators import Estimator, Update
 from kalmark.filter.map import Map, StochasticMap
-from kalmark.slam.motion import Moving, Part
+from kalmark.slam.held_control import Moving, Part
 from kalmark.slam.replacing import NEEDED
 
 LASTS_S = 30.0  # readings fit an alternative that is right; the errors of receivers among houses seldom last so long

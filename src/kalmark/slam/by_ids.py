@@ -18,7 +18,7 @@ from kalmark.slam.checks import measurements
 from kalmark.slam.held_readings import again
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
-from kalmark.slam.surveyed import is_tried
+from kalmark.slam.surveyed_corrections import is_tried
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.scan import ScanContext
 

@@ -14,10 +14,10 @@ from kalmark.association.averaging import average, outcomes
 from kalmark.association.protocol import Decision, Mixture
 from kalmark.filter.estimators import Averaging, Correction, Update
 from kalmark.geometry.gaussian import gate
-from kalmark.management import depths, tags
+from kalmark.management import ambiguous_tags, measured_depths
 from kalmark.management.attention import chosen
 from kalmark.report import INDEFINITE, Judged, Observation
-from kalmark.slam import surveyed, tentative
+from kalmark.slam import surveyed_corrections, tentative
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import ObservationModel
@@ -44,14 +44,14 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         if not rows:
             continue
         names: list[Any] = [decisions[k][0] for k in rows]
-        on_trial = surveyed.is_tried(state, scan.event.robot, names)
-        least = surveyed.gate_of(state, scan, policy) if on_trial else math.inf
+        on_trial = surveyed_corrections.is_tried(state, scan.event.robot, names)
+        least = surveyed_corrections.gate_of(state, scan, policy) if on_trial else math.inf
         slots = state.tracks.slots_of(names)
         approach = partial(_approach, state, scan, model, slots, rows, None)
         approach(range(len(rows)), least)
         update = scan.update(model, slots, rows)
         done = (
-            surveyed.corrected(state, scan, names, update, least, state.estimator, approach)
+            surveyed_corrections.corrected(state, scan, names, update, least, state.estimator, approach)
             if on_trial
             else state.corrected(update, scan.event)
         )
@@ -73,14 +73,16 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
         groups = [(model, [k]) for model, rows in groups for k in rows]
     if groups and len(groups[0][1]) < len(scan.y):
         report.blank(scan.channel.dof)
-    least = surveyed.gate_of(state, scan, policy) if groups else math.inf
+    least = surveyed_corrections.gate_of(state, scan, policy) if groups else math.inf
     judged = []
     for model, rows in groups:
         names: list[Any] = [decisions[k][0] for k in rows]
         l, estimator = known.means(names), state.estimator.for_fixes()
         approach = partial(_approach, state, scan, model.exactly, np.full(len(rows), scan.robot), rows, l)
         approach(range(len(rows)), least)
-        done = surveyed.corrected(state, scan, names, scan.known_update(model, l, rows), least, estimator, approach)
+        done = surveyed_corrections.corrected(
+            state, scan, names, scan.known_update(model, l, rows), least, estimator, approach
+        )
         done = done._replace(e=done.e[:, :m])
         report.fill(rows, done)
         known.count(names, done.fused.tolist())
@@ -112,8 +114,8 @@ def _approach(
     """
     at = list(some)
     mine, of, exactly = [rows[i] for i in at], slots[at], None if known is None else known[at]
-    found = [tags.approach(scan, model, of, mine, exactly)] if scan.channel.far is not None else []
-    found += [depths.approach(scan, model, of, mine)] if scan.channel.depths and known is None else []
+    found = [ambiguous_tags.approach(scan, model, of, mine, exactly)] if scan.channel.far is not None else []
+    found += [measured_depths.approach(scan, model, of, mine)] if scan.channel.depths and known is None else []
     estimator, used = state.estimator if known is None else state.estimator.for_fixes(), False
     for near in found:
         used |= near is not None and bool(

@@ -29,7 +29,7 @@ from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import Space
 from kalmark.models.observe import linearize
 from kalmark.slam.alternative import Alternative
-from kalmark.slam.motion import Moving, Part
+from kalmark.slam.held_control import Moving, Part
 from kalmark.tracks.linearity import SIGMAS, bends, turn_holds, turned
 from kalmark.tracks.surveys import SURVEYED
 

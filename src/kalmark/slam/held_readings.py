@@ -20,7 +20,7 @@ from kalmark.arrays import Array
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate
 from kalmark.report import Observation, Report
-from kalmark.slam.motion import Part
+from kalmark.slam.held_control import Part
 
 AGAIN = "it repeats the one before to the last bit, though the robot has moved: it is no new measurement"
 SELDOM = 0.01  # of new measurements may be taken for old ones

@@ -9,11 +9,11 @@ import numpy as np
 
 from kalmark.errors import MapError
 from kalmark.events import Id
-from kalmark.management import existence, reparametrize, walls
-from kalmark.management import repeats as of_map
+from kalmark.management import existence, reparametrize, wall_growth
+from kalmark.management import repeated_places as of_map
 from kalmark.models.protocols import Reparametrizable, Segmented
 from kalmark.report import Observation
-from kalmark.slam import merging, surveyed, tentative
+from kalmark.slam import merging, surveyed_corrections, tentative
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.scan import ScanContext
@@ -41,7 +41,7 @@ def review(state: State, scan: ScanContext, policy: Policy, seen: Sequence[Obser
             state.map.remove(old)
     if scan.channel.joins:
         mine = [track for _, track in fused]
-        for track, extent in zip(mine, walls.grown(scan, mine, [o.index for o, _ in fused]), strict=True):
+        for track, extent in zip(mine, wall_growth.grown(scan, mine, [o.index for o, _ in fused]), strict=True):
             track.extent = extent
     for o, track in fused if not scan.channel.joins else ():
         if track.extent is not None and isinstance(track.model, Segmented) and track.model.extend:
@@ -73,7 +73,7 @@ def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
     report, ids = scan.report, scan.event.ids
     for name in state.surveys.wrong() if state.surveys.misfits and not state.sums else ():  # else it may be the robot
         state.remove(name)
-        report.removed += ((name, surveyed.ELSEWHERE),)
+        report.removed += ((name, surveyed_corrections.ELSEWHERE),)
     if existence.concerns(scan, policy.upkeep):
         for track in existence.gone(state.tracks, policy.upkeep, existence.look(scan, policy.upkeep)):
             state.remove(track.id)

@@ -11,8 +11,8 @@ import numpy as np
 from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Update
-from kalmark.management import merge, walls
-from kalmark.management import repeats as of_map
+from kalmark.management import merge, wall_growth
+from kalmark.management import repeated_places as of_map
 from kalmark.models.protocols import Joining
 from kalmark.report import Repeat
 from kalmark.slam.policy import Policy
@@ -46,7 +46,7 @@ def merge_seen(state: State, scan: ScanContext, policy: Policy) -> None:
 
 def _join(state: State, scan: ScanContext, names: Sequence[Id], odds: float) -> None:
     """Merge walls of which segments join, of those observed and others."""
-    while (found := walls.agreeing(state.map, state.tracks, scan.channel, names, odds)) is not None:
+    while (found := wall_growth.agreeing(state.map, state.tracks, scan.channel, names, odds)) is not None:
         merged = _merge_pairs(state, scan, found)
         scan.report.merged += tuple(merged)
         if not merged:  # the map is full
@@ -69,7 +69,7 @@ def _merge_pairs(state: State, scan: ScanContext, found: merge.Merge) -> list[tu
             continue
         one, other = state.tracks.confirmed[kept], state.tracks.confirmed[gone]
         if isinstance(one.model, Joining):
-            one.extent = walls.united(state.map, one, other)
+            one.extent = wall_growth.united(state.map, one, other)
         state.tracks.merge(one, other)
         state.remove(gone)
         why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
@@ -96,7 +96,7 @@ def make_equal(state: State, channel: Channel, robot: int, pairs: Sequence[tuple
 def _difference(state: State, pair: tuple[Id, Id]) -> Start:
     """Return the difference of two landmarks as a block, to be observed as zero."""
     of_walls = isinstance(state.tracks.confirmed[pair[0]].model, Joining)
-    return (walls if of_walls else merge).difference(state.map, state.tracks, pair)
+    return (wall_growth if of_walls else merge).difference(state.map, state.tracks, pair)
 
 
 def search_repeats(state: State, scan: ScanContext, policy: Policy) -> None:

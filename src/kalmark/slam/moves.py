@@ -11,7 +11,7 @@ from kalmark.errors import EventError, MapError
 from kalmark.events import seconds
 from kalmark.geometry.spaces import Rn
 from kalmark.report import Gap
-from kalmark.slam.motion import Part
+from kalmark.slam.held_control import Part
 from kalmark.slam.state import State
 
 Moves = tuple[tuple[str, Part], ...]  # parts of their controls, by the names of robots

@@ -11,11 +11,11 @@ from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Associati
 from kalmark.errors import ModelError
 from kalmark.events import Scan
 from kalmark.filter.estimators import Estimator
+from kalmark.management.ambiguous_tags import Mirrored
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
 from kalmark.management.hypotheses import Hypotheses
 from kalmark.management.pending import Initialization
-from kalmark.management.tags import Mirrored
 from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.landmarks import AnchoredHomogeneous, AsPoint

@@ -19,8 +19,8 @@ from kalmark.models import protocols
 from kalmark.models.protocols import CHANGE, POSE, HoldsRate, Motion, OfState
 from kalmark.models.state_view import sees_state, state_view_of
 from kalmark.slam.checks import measurements
-from kalmark.slam.motion import Mean, Moving
-from kalmark.slam.standing import Standing
+from kalmark.slam.held_control import Mean, Moving
+from kalmark.slam.rests import Standing
 
 POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures where an antenna is
 LEAST_S = 1e-6  # between two readings that tell how the robot moved

@@ -42,8 +42,8 @@ from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
 from kalmark.slam.alternative import Alternative, alone
 from kalmark.slam.gaussian_sum import GaussianSum
+from kalmark.slam.held_control import Mean, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import Given
-from kalmark.slam.motion import Mean, Moving, bias_block, bias_name
 from kalmark.slam.reader import Reader
 from kalmark.slam.replacing import LeftOut
 from kalmark.slam.robot import Mount, Robot, mount_name

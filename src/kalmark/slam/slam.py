@@ -50,7 +50,7 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.protocols import Landmark, UnknownDepth
 from kalmark.report import Observation, Report, outcomes_of
-from kalmark.slam import by_ids, locating, maintenance, moves, own_readings, starting, tentative
+from kalmark.slam import by_ids, locating, maintenance, moves, starting, state_corrections, tentative
 from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
 from kalmark.slam.checks import numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
@@ -139,7 +139,7 @@ class Slam(Estimate):
             if not isinstance(event, Frame):
                 state.settle()
             if event.robot in state.standing:
-                report.standing = own_readings.stood(state, event)
+                report.standing = state_corrections.stood(state, event)
             if event.t_ns != before:
                 self.state.taken.clear()
                 self._ahead = []
@@ -190,7 +190,7 @@ class Slam(Estimate):
         state = self.state
         key = event.robot, event.sensor
         if key in state.readers:
-            return own_readings.read(state, event, state.readers[key])
+            return state_corrections.read(state, event, state.readers[key])
         policy = self._policy(event)
         return self._found(event if policy.detector is None else policy.detector(event))
 
@@ -300,7 +300,7 @@ class Slam(Estimate):
         return report
 
     def _fix(self, event: Fix) -> Report:
-        return own_readings.fix(self.state, event)
+        return state_corrections.fix(self.state, event)
 
     # ------------------------------------------------------------------ scans
     def _fuse(self, scan: ScanContext, policy: Policy) -> None:
@@ -426,9 +426,9 @@ class Slam(Estimate):
     def warm_up(self) -> None:
         """Compile and load all that the events of this Slam will need, so that none of them waits for it.
 
-        Its state stays as it is: twins of it take made-up events, as `kalmark.slam.rehearsal` has them.
+        Its state stays as it is: twins of it take made-up events, as `kalmark.slam.warm_up_events` has them.
         """
-        from kalmark.slam.rehearsal import rehearse, warm_up_detectors, without_detectors
+        from kalmark.slam.warm_up_events import rehearse, warm_up_detectors, without_detectors
 
         warm_up_detectors(self.robots.values())
         robots, settings = without_detectors(self.robots.values()), self.state.settings

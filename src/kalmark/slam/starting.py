@@ -11,7 +11,7 @@ import numpy as np
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
 from kalmark.errors import MapError
 from kalmark.events import Id
-from kalmark.management import baselines, delayed, tags, walls
+from kalmark.management import ambiguous_tags, baselines, delayed, wall_growth
 from kalmark.management.pending import Initialization, Step
 from kalmark.models.protocols import distances_alone
 from kalmark.report import ALONE, Observation
@@ -56,7 +56,7 @@ def _initialized(state: State, scan: ScanContext, policy: Policy, k: int, name: 
     except MapError as full:
         return Observation(k, id_, "ignored", None, None, str(full))
     if channel.joins:
-        track.extent = walls.first_extent(scan, track, k)
+        track.extent = wall_growth.first_extent(scan, track, k)
     if not tentative:
         state.tracks.confirm(track)
         return Observation(k, id_, "new", name, None, reason)
@@ -117,7 +117,11 @@ def _refusal(state: State, scan: ScanContext, policy: Policy, k: int, name: Any,
     if not scan.channel.is_ambiguous:
         why = f"a {sensor} measurement without an id cannot start a landmark"
         return Observation(k, id_, "ignored", None, None, why)
-    return None if tags.is_clear(scan, k) else Observation(k, id_, "deferred", None, None, tags.MIRRORED)
+    return (
+        None
+        if ambiguous_tags.is_clear(scan, k)
+        else Observation(k, id_, "deferred", None, None, ambiguous_tags.MIRRORED)
+    )
 
 
 def _defer(state: State, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:

@@ -20,12 +20,12 @@ from kalmark.models.protocols import Landmark, OfState, world_of
 from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
 from kalmark.slam.gaussian_sum import GaussianSum
+from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import SELDOM, Given
-from kalmark.slam.motion import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, policy_of, refuse_other_world
 from kalmark.slam.reader import LEAST_S, Reader
+from kalmark.slam.rests import standing_of
 from kalmark.slam.robot import Robot, mount_name
-from kalmark.slam.standing import standing_of
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.front_ends import FrontEnd, SearchingDetector

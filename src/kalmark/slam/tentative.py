@@ -20,7 +20,7 @@ from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.estimators import Update
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.management import confirm, merge, tags, walls
+from kalmark.management import ambiguous_tags, confirm, merge, wall_growth
 from kalmark.report import Judged, Observation
 from kalmark.slam.policy import Policy
 from kalmark.slam.starting import SINGULAR
@@ -53,7 +53,7 @@ def compare(state: State, scan: ScanContext, policy: Policy, new: list[int], dec
         track, u = state.tracks.tentative[match.name], policy.upkeep
         track.hits, track.chances, track.unseen = track.hits + 1, track.chances + 1, -1
         if scan.channel.joins:
-            track.extent = walls.grown(scan, [track], [match.k])[0]
+            track.extent = wall_growth.grown(scan, [track], [match.k])[0]
         if u.confirms(track.hits):
             confirmed[match.k] = match.name, f"confirmed: seen in {track.hits} of {track.chances} scans"
             _confirm(state, scan, track)
@@ -157,7 +157,7 @@ def _agrees(scan: ScanContext, model: ObservationModel, rival: Track, k: int) ->
 
 def _begin(state: State, scan: ScanContext, name: Id, k: int, before: Track | None) -> None:
     """Begin the other place of a landmark at the k-th observation, in the place of one `before` that was seen once."""
-    if (before is not None and before.hits > 1) or (scan.channel.is_ambiguous and not tags.is_clear(scan, k)):
+    if (before is not None and before.hits > 1) or (scan.channel.is_ambiguous and not ambiguous_tags.is_clear(scan, k)):
         return
     with suppress(np.linalg.LinAlgError, MapError):  # it is full
         start = scan.start_of(k)

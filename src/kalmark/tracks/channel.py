@@ -15,11 +15,11 @@ from kalmark.errors import ModelError
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
 from kalmark.filter.map import AT_ONCE, Map, StochasticMap
-from kalmark.filter.neighbours import has_place
+from kalmark.filter.nearest_blocks import has_place
 from kalmark.geometry.gaussian import gate
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
-from kalmark.models.known import known_view
+from kalmark.models.known_view import known_view
 from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
 from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, of_pair, sees_kinds

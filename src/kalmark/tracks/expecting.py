@@ -15,7 +15,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id
 from kalmark.filter.map import AT_ONCE, Map
-from kalmark.filter.observed import innovation, observed_block
+from kalmark.filter.observed_block import innovation, observed_block
 from kalmark.models import protocols
 from kalmark.models.observe import composed, linearize
 from kalmark.report import Expectations

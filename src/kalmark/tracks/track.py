@@ -15,7 +15,7 @@ from kalmark.events import Id
 from kalmark.models.protocols import Landmark, Segmented
 from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
 from kalmark.tracks.clones import Measurement
-from kalmark.tracks.known import KnownLandmarks
+from kalmark.tracks.known_landmarks import KnownLandmarks
 from kalmark.tracks.looks import Looks
 
 Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan

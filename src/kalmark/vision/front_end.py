@@ -23,20 +23,20 @@ from kalmark.geometry.rotations import matrix
 from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
 from kalmark.tracks.channel import Channel
-from kalmark.tracks.prospect import PIXEL, Prospect, places_of
+from kalmark.tracks.joint_expectation import PIXEL, Prospect, places_of
 from kalmark.tracks.track import Tracks
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
 from kalmark.vision.beginning import Beginning, Begun
-from kalmark.vision.depths import inverse_depths, with_depths
+from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
-from kalmark.vision.matching import Searcher, shift_covariances
 from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import NUMBERS, Plane, measured, shown
 from kalmark.vision.recognition import matched_again, recognised
 from kalmark.vision.searches import TRIAL, Searches
 from kalmark.vision.selection import Search, Selection
-from kalmark.vision.surveyed import FirstLook
+from kalmark.vision.surveyed_corners import FirstLook
+from kalmark.vision.template_matching import Searcher, shift_covariances
 
 FEW, ENOUGH = 4, 20  # matches, with fewer of which the sensor is lost; landmarks by which it may recognise the place
 EVERY, AWAY = 5, 30  # frames: how often it asks if a place is seen again; how long landmarks of it were not found

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.report import Report
-from kalmark.tracks.prospect import PIXEL
+from kalmark.tracks.joint_expectation import PIXEL
 from kalmark.vision.front_end import FrontEnd
 from kalmark.vision.segments import LineFrontEnd
 from kalmark.vision.selection import GATE, Selection

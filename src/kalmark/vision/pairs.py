@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.vision.depths import DepthPrior
-from kalmark.vision.matching import Searcher
+from kalmark.vision.depth_images import DepthPrior
 from kalmark.vision.selection import GATE
+from kalmark.vision.template_matching import Searcher
 
 UNKNOWN = 1e3  # px
 BACK_PX = 1.0  # the way back from the right image must end so near to where it began

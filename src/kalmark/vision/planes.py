@@ -21,7 +21,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.rotations import matrix
-from kalmark.vision.depths import EDGE
+from kalmark.vision.depth_images import EDGE
 
 SIGMA_SLOPE = 1.0  # of the prior: 45 deg
 STEEPEST = 2.0  # 63 deg

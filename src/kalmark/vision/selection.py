@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.tracks.prospect import PIXEL, Belief, Prospect
-from kalmark.vision.matching import Searcher
+from kalmark.tracks.joint_expectation import PIXEL, Belief, Prospect
+from kalmark.vision.template_matching import Searcher
 
 GATE = 9.0  # of d2: three sigmas of each axis of an ellipse
 MOST_AREA_PX = 10_000.0  # of an ellipse that is searched; a larger one is reduced to it

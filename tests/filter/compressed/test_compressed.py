@@ -13,9 +13,8 @@ import pytest
 import kalmark as km
 from kalmark.errors import MapError
 from kalmark.filter import kernels
-from kalmark.filter.compressed import map as compressed_map
-from kalmark.filter.compressed import ranks
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed import compressed_map, ranks
+from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.compressed.schedule import Schedule
 from kalmark.filter.compressed.storage import PANEL, Triangle
 from kalmark.filter.map import StochasticMap

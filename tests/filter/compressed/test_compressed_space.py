@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.compressed.schedule import Schedule
 from kalmark.filter.estimators import Update
 from kalmark.filter.map import StochasticMap

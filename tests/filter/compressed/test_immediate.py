@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.filter.compressed import immediate
-from kalmark.filter.compressed.map import CompressedMap
+from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.map import StochasticMap
 
 WORLD = np.column_stack([np.arange(0.0, 40.0, 2.0), np.tile([1.5, -1.5], 10)])

@@ -21,8 +21,8 @@ from kalmark.errors import LogError
 from kalmark.events import shown, unit_quaternion
 from kalmark.logs.bag.messages import MESSAGES, Measured, Message, Place, Pose, Seen, Twist, named
 from kalmark.logs.bag.topics import Scans, Topic
-from kalmark.logs.columns import CANONICAL, FACTORS, GLOBE, INERTIAL, POSE3, POSITION, TWIST3
 from kalmark.logs.table import Refused
+from kalmark.logs.table_columns import CANONICAL, FACTORS, GLOBE, INERTIAL, POSE3, POSITION, TWIST3
 
 ID = "id"
 OWN = (*POSE3, "theta_rad", *GLOBE, "v_mps", "steering_rad", "w_radps", *TWIST3, *INERTIAL)

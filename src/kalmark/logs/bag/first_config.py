@@ -8,15 +8,15 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from kalmark.logs.bag.asked import short
+from kalmark.logs.bag.configured_topics import short
 from kalmark.logs.bag.first_readings import Readings
 from kalmark.logs.bag.first_sensors import CLUSTERS, IDS, entry_of, is_tag, line_of
 from kalmark.logs.bag.first_start import POSE_M, start_of
 from kalmark.logs.bag.first_words import GUESS, mapping, quoted, told
-from kalmark.logs.bag.frames import BASES
 from kalmark.logs.bag.importer import DAY_NS
 from kalmark.logs.bag.survey import Survey, TopicSummary, yaw
-from kalmark.logs.columns import BEAM, CORNERS, POSE3
+from kalmark.logs.bag.tf_frames import BASES
+from kalmark.logs.table_columns import BEAM, CORNERS, POSE3
 
 TRUE = ("truth", "vicon", "mocap", "optitrack", "/gt", "gt_", "_gt")
 LATER = ("filtered", "global", "map", "gps")  # odometry of these names has been corrected by something else

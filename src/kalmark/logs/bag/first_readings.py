@@ -10,14 +10,14 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry import rotations
-from kalmark.logs.bag.asked import sensor_name
+from kalmark.logs.bag.configured_topics import sensor_name
 from kalmark.logs.bag.first_sensors import mount_of
 from kalmark.logs.bag.first_start import Start
 from kalmark.logs.bag.first_words import GUESS, mapping, quoted, told
-from kalmark.logs.bag.inertial import heading_of, heading_of_field
+from kalmark.logs.bag.inertial_messages import heading_of, heading_of_field
 from kalmark.logs.bag.messages import Measured
-from kalmark.logs.bag.mounts import LEVEL
 from kalmark.logs.bag.survey import Survey, TopicSummary
+from kalmark.logs.bag.tf_mounts import LEVEL
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.source import placed
 

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.logs.bag.asked import sensor_name
+from kalmark.logs.bag.configured_topics import sensor_name
 from kalmark.logs.bag.first_words import GUESS, mapping
 from kalmark.logs.bag.survey import Survey, TopicSummary
 from kalmark.logs.bag.topics import Scans
-from kalmark.logs.columns import BEAM, CORNERS, POSE3, POSITION
 from kalmark.logs.source import placed
+from kalmark.logs.table_columns import BEAM, CORNERS, POSE3, POSITION
 
 CAMERA = {"fx_px": 600.0, "fy_px": 600.0, "cx_px": 640.0, "cy_px": 512.0, "width_px": 1280, "height_px": 1024}
 IDS, CLUSTERS = ("id", "ids", "track_id", "label"), ("cluster", "cluster_id", "segment")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from kalmark.logs.bag.asked import short
+from kalmark.logs.bag.configured_topics import short
 from kalmark.logs.bag.survey import TopicSummary
 
 GUESS = "GUESS:"

@@ -18,7 +18,7 @@ from kalmark.geometry import rotations
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.bag import tables
-from kalmark.logs.bag.asked import Asked, sensor_name, short
+from kalmark.logs.bag.configured_topics import Asked, sensor_name, short
 from kalmark.logs.bag.messages import (
     MESSAGES,
     NO_ROTATION,
@@ -27,9 +27,9 @@ from kalmark.logs.bag.messages import (
     Pose,
     Seen,
 )
-from kalmark.logs.bag.mounts import Mounts
-from kalmark.logs.bag.own_readings import Gathered, OwnReadings
-from kalmark.logs.bag.reading import Bag, Received, declared, find_bag, has_header, stamp
+from kalmark.logs.bag.opening import Bag, Received, declared, find_bag, has_header, stamp
+from kalmark.logs.bag.state_topics import Gathered, OwnReadings
+from kalmark.logs.bag.tf_mounts import Mounts
 from kalmark.logs.bag.topics import (
     Fixes,
     Images,
@@ -44,12 +44,12 @@ from kalmark.logs.bag.topics import (
     Truths,
     topic_of,
 )
-from kalmark.logs.columns import BEAM, POSE3, POSITION
 from kalmark.logs.geodesy import fault, local
-from kalmark.logs.images.pictures import Forward
+from kalmark.logs.images.image_files import Forward
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, seconds
 from kalmark.logs.table import Refused
+from kalmark.logs.table_columns import BEAM, POSE3, POSITION
 
 FOREVER_S = 1e9
 DAY_NS = 86_400_000_000_000

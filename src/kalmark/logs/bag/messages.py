@@ -20,9 +20,9 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.events import unit_quaternion
 from kalmark.logs.bag.topics import Scans
-from kalmark.logs.calibration import lens
-from kalmark.logs.columns import BEAM, CORNERS, POSE3, POSITION
+from kalmark.logs.camera_calibration import lens
 from kalmark.logs.table import Refused
+from kalmark.logs.table_columns import BEAM, CORNERS, POSE3, POSITION
 
 NO_FIX = 0  # of NavSatStatus: what is below has no fix
 UNKNOWN_COVARIANCE = 0

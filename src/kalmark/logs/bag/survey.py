@@ -12,10 +12,10 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.geometry import rotations
 from kalmark.logs.bag.fields import offers, recognised
-from kalmark.logs.bag.frames import Frames
 from kalmark.logs.bag.messages import MESSAGES, Measured, Message, Pose
-from kalmark.logs.bag.reading import UNDEFINED, Bag, declared, frame_id, has_header, stamp
+from kalmark.logs.bag.opening import UNDEFINED, Bag, declared, frame_id, has_header, stamp
 from kalmark.logs.bag.tables import holds_log
+from kalmark.logs.bag.tf_frames import Frames
 from kalmark.logs.bag.topics import Scans
 from kalmark.logs.table import Refused
 

@@ -26,13 +26,13 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import EventError, LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, order, when
-from kalmark.logs.bag.reading import Bag, Received
-from kalmark.logs.bag.write import RECORD, Outgoing, header
-from kalmark.logs.columns import GPS as GPS_COLUMNS
-from kalmark.logs.columns import POSE2, POSE3, POSITION
+from kalmark.logs.bag.mcap_writer import RECORD, Outgoing, header
+from kalmark.logs.bag.opening import Bag, Received
 from kalmark.logs.log import Log, PositionTrack, Trajectory
+from kalmark.logs.native_writer import id_text
 from kalmark.logs.source import Request, landmark_id
-from kalmark.logs.write import id_text
+from kalmark.logs.table_columns import GPS as GPS_COLUMNS
+from kalmark.logs.table_columns import POSE2, POSE3, POSITION
 
 ROOT = "/kalmark/"
 LOG = ROOT + "log"

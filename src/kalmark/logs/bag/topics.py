@@ -14,8 +14,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from kalmark.declare import Number, Within, class_of, classes, declared, parameters, refuse, register
 from kalmark.errors import LogError, ModelError
 from kalmark.events import Id, is_number, shown
-from kalmark.logs.columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 from kalmark.logs.source import POSE_KEYS, landmark_id, nanoseconds, nearest
+from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 
 
 @declared

@@ -13,7 +13,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.events import Control, Fix
 from kalmark.geometry.rotations import from_matrix
-from kalmark.logs.bag.write import Outgoing, header, stamp
+from kalmark.logs.bag.mcap_writer import Outgoing, header, stamp
 from kalmark.logs.log import Log
 
 MAP = "map"

@@ -17,12 +17,12 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Frame, shown
 from kalmark.files import unpacked
-from kalmark.logs.calibration import read_calibration
-from kalmark.logs.columns import INERTIAL, TWIST3
-from kalmark.logs.images.pictures import frames_of
+from kalmark.logs.camera_calibration import read_calibration
+from kalmark.logs.images.image_files import frames_of
 from kalmark.logs.images.rigs import MOTION, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Times, Trajectory, interpolate
 from kalmark.logs.source import Format, Request, choice, nearest, number, placed, read_text
+from kalmark.logs.table_columns import INERTIAL, TWIST3
 from kalmark.models.motion import shaken
 
 TRUE_STATES = "state_groundtruth_estimate0/data.csv"

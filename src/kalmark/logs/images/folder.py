@@ -17,7 +17,7 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.events import Frame, shown
-from kalmark.logs.images.pictures import ENDINGS, Forward, frames_of, video_facts, video_images
+from kalmark.logs.images.image_files import ENDINGS, Forward, frames_of, video_facts, video_images
 from kalmark.logs.images.rigs import CAMERA, ROBOT, calibration_beside, camera, camera_log, no_times
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows, read_path

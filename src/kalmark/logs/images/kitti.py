@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from kalmark.errors import LogError
-from kalmark.logs.calibration import INTRINSICS
+from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.images.folder import TIMES, images_in, read_times
-from kalmark.logs.images.pictures import frames_of
+from kalmark.logs.images.image_files import frames_of
 from kalmark.logs.images.rigs import CAMERA, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows

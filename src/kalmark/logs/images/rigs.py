@@ -8,8 +8,8 @@ from typing import Any
 
 from kalmark.errors import LogError
 from kalmark.events import Event, Frame
-from kalmark.logs.calibration import read_calibration
-from kalmark.logs.images.pictures import size_of
+from kalmark.logs.camera_calibration import read_calibration
+from kalmark.logs.images.image_files import size_of
 from kalmark.logs.log import Log
 from kalmark.logs.source import Request, one_robot
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from kalmark.errors import LogError
 from kalmark.events import shown
-from kalmark.logs.images.pictures import DEPTH_SCALE, frames_of
+from kalmark.logs.images.image_files import DEPTH_SCALE, frames_of
 from kalmark.logs.images.rigs import CAMERA, ROBOT, calibration_beside, camera, camera_log
 from kalmark.logs.log import Log
 from kalmark.logs.poses import read_path

@@ -1,0 +1,209 @@
+"""The search for causes of a run: in its batch problem, or a part of it, from the optimum or from a robust solution."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc
+
+from kalmark.arrays import Array
+from kalmark.batch.batch_state import Ints, State
+from kalmark.batch.data import Associations, Given, replayed
+from kalmark.batch.problem import Problem
+from kalmark.batch.solver import Batch, optimum
+from kalmark.diagnosis import repeated_events
+from kalmark.diagnosis.cause_search import Search
+from kalmark.diagnosis.error_columns import Where
+from kalmark.diagnosis.gross_mistakes import MISFIT, filtered, fit
+from kalmark.diagnosis.linear import Linear
+from kalmark.diagnosis.mistakes import with_value
+from kalmark.errors import KalmarkError
+from kalmark.logs.log import Log
+from kalmark.models.protocols import Calibrated
+from kalmark.models.sensors import Wall
+from kalmark.results.batch import filtered_map, given_by
+from kalmark.results.measures import cut_off
+from kalmark.results.run import Run
+from kalmark.slam.robot import Mount
+from kalmark.slam.slam import Slam
+
+NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
+EVENTS = 4  # times as many as observations are taken
+SEGMENT = 30  # successive scans of each robot that are taken together where not all are
+MORE = 4  # times as many are taken if the segments do not determine the map, up to `MOST` at the end of a run
+HUBER = 30.0, 10.0, 3.0, 1.5  # sigmas, beyond which observations count less for a robust solution, one after the other
+ROUGHLY = 1e-3  # of the map's size, is its last step
+GATE = 0.9999  # with which a log that does not fit is filtered again
+SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
+LOOKED_INTO = 3  # segments with the worst scans
+
+
+class Searched(NamedTuple):
+    """A search for causes that is done, and the batch solution that it began at; what is far off may have pulled it."""
+
+    search: Search
+    batch: Batch
+    given: Given
+    pulled: bool = False
+
+
+def searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
+    """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none.
+
+    Where `most` observations do not solve it, more are tried, up to a `limit`: all of a long log take minutes.
+    """
+    every = calibrated(run, once(run, given_by(run)))
+    if not every.associations.landmark:
+        raise KalmarkError("no observation was of a landmark in the map")
+    given = thinned(run, every, most)
+    try:
+        problem = replayed(given, log)
+        batch = optimum(problem, tolerance=NEAR)
+    except KalmarkError:
+        if given is not every and min(MORE * most, len(every.associations.landmark)) <= limit:
+            return searched(run, log, MORE * most, limit, progress)
+        found = searched_robustly(run, log, thinned(run, regated(run, log, every), most), progress)
+        if found is None:
+            raise
+        return found
+    search = Search(Linear.of(problem, batch.state, within_gates(run)), sensors_of(run), given.t_ns)
+    search.run(progress)
+    if any(f.rows is not None for f in search.found) and fit(run).mean > MISFIT:  # they have pulled the solution
+        again = searched_robustly(run, log, thinned(run, regated(run, log, every), most), progress)
+        return again or Searched(search, batch, given)
+    return Searched(search, batch, given)
+
+
+def searched_robustly(run: Run, log: Log, given: Given, progress: bool) -> Searched | None:
+    """Search for causes from a robust solution, with what is far off there taken out first; None if it has none."""
+    problem = replayed(given, log)
+    batch = robust(problem, problem.start)
+    if batch is None:
+        return None
+    search = Search(Linear.of(problem, batch.state, within_gates(run)), sensors_of(run), given.t_ns)
+    search.take_outliers()
+    search.run(progress)
+    return Searched(search, batch, given, pulled=True)
+
+
+def regated(run: Run, log: Log, given: Given) -> Given:
+    """Return it with the path and the map of the log filtered again with a gate: what is far off pulls these less."""
+    if (run.config.get("association") or {}).get("type") != "identity":
+        return given
+    gated = with_value(run.config, ("association",), {"type": "identity", "gate": GATE})
+    again = filtered(gated, log, log.events)
+    if again is None or not np.array_equal(again.history.t_ns, given.t_ns):
+        return given
+    return replace(given, poses=given_by(again).poses, landmarks={**given.landmarks, **filtered_map(again)})
+
+
+def robust(problem: Problem, state: State) -> Batch | None:
+    """Return the solution in which observations beyond fewer and fewer sigmas count less, from a state on, if any."""
+    found = None
+    for huber in HUBER:
+        with suppress(KalmarkError):  # from a better start the next one may be found
+            less = tuple(replace(factor, huber=huber) for factor in problem.factors)
+            found = optimum(replace(problem, factors=less), state, tolerance=ROUGHLY)
+            state = found.state
+    return found
+
+
+def once(run: Run, given: Given) -> Given:
+    """Return it without the scans that are copies of the one before."""
+    twice = np.unique(run.history.step[repeated_events.of_scans(run)])
+    used = given.associations
+    rows = np.flatnonzero(~np.isin(used.scan, twice))
+    return given if len(rows) == len(used.scan) else replace(given, associations=_rows(used, rows))
+
+
+def _rows(used: Associations, rows: Ints) -> Associations:
+    names = [used.landmark[k] for k in rows.tolist()]
+    return Associations(used.scan[rows], used.sensor[rows], used.index[rows], names, used.e[rows])
+
+
+def calibrated(run: Run, given: Given) -> Given:
+    """Return it with the mounts, ranges and controls that calibrate themselves as they were in the end."""
+    slam, robots = run.final_slam(), {}
+    for name, robot in given.robots.items():
+        sensors = {key: _calibrated(slam, f"{name}.{key}", mount) for key, mount in robot.sensors.items()}
+        robots[name] = replace(robot, sensors=sensors)
+    return replace(given, robots=robots, biases={bias.robot: bias.mean for bias in run.history.biases})
+
+
+def _calibrated(slam: Slam, name: str, mount: Mount) -> Mount:
+    """Return a mount as it is in the map, if it is there."""
+    if mount.block(name) is None:
+        return mount
+    mean, pose, sensor = slam.mean(name), len(mount.at), mount.sensor
+    if isinstance(sensor, Calibrated) and len(mean) > pose:
+        sensor = sensor.with_parameters(mean[pose:])
+    return replace(mount, at=mean[:pose], sensor=sensor, cov=None)
+
+
+def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
+    """Return the columns that each sensor of a run measures, by robot and sensor; of a wall those that have a noise."""
+    robots, found = run.final_slam().robots.values(), {}
+    for key, sensor in (((r.name, name), m.sensor) for r in robots for name, m in r.sensors.items()):
+        columns = tuple(sensor.columns)
+        found[key] = tuple(c for c in columns if f"sigma_{c}" in sensor.sigmas) if isinstance(sensor, Wall) else columns
+    return found
+
+
+def within_gates(run: Run) -> dict[Where, Array]:
+    """Return by what factor (p,) the noise that a sensor's gate leaves is smaller than that of all its observations.
+
+    A gate leaves innovations of covariance k Z (`cut_off`).  Their noise has then R - (1 - k) R Z^-1 R, of which the
+    shares that R has of Z on the diagonals are taken here.
+    """
+    h, found = run.history, {}
+    robots = h.robot[h.step]
+    for key, channel in run.final_slam().state.channels.items():
+        mine = (h.outcome == "associated") & (robots == key[0]) & (h.sensor == key[1])
+        k = cut_off(channel.gate, channel.dof)
+        if k < 1.0 and mine.any():
+            share = h.noise[mine] ** 2 / np.diagonal(h.Z[mine], axis1=1, axis2=2)
+            share = share[:, np.isfinite(share).any(axis=0)]
+            found[key] = np.sqrt(1.0 - (1.0 - k) * np.nanmean(np.minimum(share, 1.0), axis=0))
+    return found
+
+
+def thinned(run: Run, given: Given, most: int) -> Given:
+    """Return about `most` of the observations: segments of successive scans, evenly over the run.
+
+    Those with the scans that fit least are among them, if these do not fit by chance: a jump is a single step.
+    """
+    used, t_ns = given.associations, given.t_ns
+    events = len(t_ns) + sum(controls.number for controls in run.history.controls.values())
+    share = most / max(len(used.landmark), events / EVENTS, 1)
+    if share >= 1.0:
+        return given
+    segment = SEGMENT * len(given.robots)
+    number = max(len(t_ns) // segment, 2)
+    even = np.linspace(0, number - 1, max(int(share * number), 2)).astype(np.int64)
+    worst = misfits(run)[1]
+    with_worst = [*dict.fromkeys(np.minimum(worst // segment, number - 1).tolist())][:LOOKED_INTO]
+    first = np.unique([*even, *with_worst]) * segment
+    last = np.minimum(first + segment, len(t_ns)) - 1
+    begins = np.maximum(first - np.isin(first, worst), 0)  # with the scan before, or there is no step
+    last[:-1] = np.minimum(last[:-1], begins[1:] - 1)
+    segments = np.stack([t_ns[begins], t_ns[last]], axis=1)
+    segments[0, 0] = np.iinfo(np.int64).min  # the motion before the first scan leads from the start to it
+    within = np.searchsorted(segments[:, 0], t_ns, side="right") - 1
+    kept = (within >= 0) & (t_ns <= segments[within, 1])
+    renumbered, rows = np.cumsum(kept) - 1, np.flatnonzero(kept[used.scan])
+    some = _rows(used, rows)
+    some = replace(some, scan=renumbered[some.scan])
+    return replace(
+        given, t_ns=t_ns[kept], robot=given.robot[kept], poses=given.poses[kept], associations=some, segments=segments
+    )
+
+
+def misfits(run: Run) -> tuple[Array, Ints]:
+    """Return the chi-square (S,) of each scan, and those that do not fit by chance, the worst first."""
+    h, now = run.history, fit(run)
+    chi2, dof = (np.bincount(h.step, of, len(h.t_ns)).astype(np.float64) for of in (now.values * now.dof, now.dof))
+    bad = np.flatnonzero(chdtrc(np.maximum(dof, 1), chi2) * len(dof) < SELDOM)
+    return chi2, bad[np.argsort(-chi2[bad])]

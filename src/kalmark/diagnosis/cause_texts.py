@@ -1,0 +1,307 @@
+"""The text of a cause, with its figure, and the line of a configuration that takes it out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from kalmark.diagnosis.causes import TIMES, Finding
+from kalmark.diagnosis.error_columns import ALL
+from kalmark.diagnosis.jumps import LISTED, OddControl, size_of
+from kalmark.results.figure_texts import figure
+from kalmark.slam.gaps import MARGIN
+
+Words = tuple[str, str]  # evidence, cure
+MOST_SIGMAS = 1e4
+RANGE = "range_m"  # the column whose scale and offset a sensor may have
+DISPARITY, INVERSE = "ur_px", "rho_per_m"  # columns that have the scale of distances through a baseline, and inversely
+UNKNOWN_IDS = "--set log.ids=hidden --set association.type=auto"
+CALIBRATIONS = {  # the keys that put an error of a column of the controls into the map, by its kind
+    ("v_mps", "offset"): "sigma_v_bias_mps",
+    ("w_radps", "offset"): "sigma_w_bias_radps",
+    ("steering_rad", "offset"): "sigma_steering_bias_rad",
+    ("v_mps", "scale"): "sigma_v_scale",
+    ("w_radps", "scale"): "sigma_w_scale",
+    ("steering_rad", "scale"): "sigma_steering_scale",
+    ("w_radps", "per_way"): "sigma_turn_rad_per_m",
+    ("dx_m", "scale"): "sigma_scale",
+    ("dtheta_rad", "scale"): "sigma_turn_scale",
+    ("dtheta_rad", "offset"): "sigma_turn_bias_radps",
+    ("dtheta_rad", "per_way"): "sigma_turn_rad_per_m",
+}
+
+
+# the keys of noises that are not called as their columns
+SIGMAS = {f"d{name}": f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "theta_rad")}
+SIGMAS |= dict.fromkeys(("rx_rad", "ry_rad", "rz_rad"), "sigma_rotation_rad")
+SIGMAS |= dict.fromkeys(("left_rad", "right_rad"), "sigma_way_m_per_sqrt_m")
+LIMITS = {
+    "v_mps": "max_speed_mps",
+    "dx_m": "max_speed_mps",
+    "w_radps": "max_turn_radps",
+    "dtheta_rad": "max_turn_radps",
+}
+
+
+def words(finding: Finding, config: Mapping[str, Any]) -> Words:
+    """Return what was found, in a sentence, and the line that would cure it, "" if no key does.
+
+    `config` is the configuration of the run: a new noise is given as a number where it states the old one.
+    """
+    tell = _TELL.get(finding.name) or (_noise if finding.unit == TIMES else _offset)
+    evidence, cure = tell(finding, config)
+    if finding.alike:
+        others = ", ".join(f"{other.name} {_value(other)}" for other in finding.alike)
+        evidence += f"; the log cannot tell this from {others}"
+    return evidence, cure
+
+
+def _value(finding: Finding) -> str:
+    """Return a size with its unit."""
+    if finding.unit in ("rad", "rad/s", "rad/m"):
+        return f"{figure(math.degrees(finding.value))} {finding.unit.replace('rad', 'deg')}"
+    return f"{finding.value:+.2%}" if not finding.unit else f"{figure(finding.value)} {finding.unit}"
+
+
+def _sure(finding: Finding) -> str:
+    return f"{figure(min(abs(finding.value) / finding.sigma, MOST_SIGMAS), 2)} sigma" if finding.sigma > 0 else ""
+
+
+def _sensor(finding: Finding) -> str:
+    return f"{ALL} of {finding.of[0]}" if finding.of[1] == ALL else ".".join(finding.of[:2])
+
+
+def _in_log(finding: Finding, config: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Yield the columns of a finding as they are in the log, where a detector measures ranges, by robot and sensor."""
+    robot, sensor, *columns = finding.of
+    sections = _current(config, robot, "sensors") or {}
+    of = [section for name, section in sections.items() if sensor in (ALL, name)]
+    raw = any(isinstance(section, Mapping) and section.get("detector") for section in of)
+    where = (robot,) if sensor == ALL else (robot, sensor)
+    yield from ((*where, column) for column in ([RANGE] if raw else columns))
+
+
+def _size(value: float, unit: str) -> str:
+    if unit.startswith("rad"):
+        return f"{figure(math.degrees(value))} {unit.replace('rad', 'deg')}"
+    return f"{value:.2%}" if not unit else f"{figure(value)} {unit}"
+
+
+def _current(config: Mapping[str, Any], robot: str, *path: str) -> Any:
+    """Return a value of a robot's section, None where the configuration does not state it."""
+    robots = config.get("robots") or {}
+    for name in (robot, "each"):
+        section: Any = robots.get(name)
+        for key in path:
+            section = section.get(key) if isinstance(section, Mapping) else None
+        if section is not None:
+            return section
+    return None
+
+
+def _set(robot: str, path: str, value: float) -> str:
+    return f"--set robots.{robot}.{path}={figure(value)}"
+
+
+def corrected(config: Mapping[str, Any], option: str, path: tuple[str, ...], by: float) -> str:
+    """Return the line that adds to the times of a sensor (`shift_s`), or multiplies a column (`factors`), of a log."""
+    now = (config.get("log") or {}).get(option)
+    for name in path:
+        now = now.get(name) if isinstance(now, Mapping) else None
+    neutral = 0.0 if option == "shift_s" else 1.0
+    old = now if isinstance(now, float | int) else neutral
+    return f"--set log.{option}.{'.'.join(path)}={figure(old + by if option == 'shift_s' else old * by, 6)}"
+
+
+def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, sensor, column = finding.of[:3]
+    evidence = f"{_lengths(finding)} are {abs(finding.value):.2%} too {_how(finding)} ({_sure(finding)})"
+    by = 1.0 + finding.value
+    if column == RANGE and sensor != ALL:
+        scale = _current(config, robot, "sensors", sensor, "scale") or 1.0
+        return evidence, _set(robot, f"sensors.{sensor}.scale", scale * by)
+    if column == DISPARITY:
+        baseline_m = _current(config, robot, "sensors", sensor, "baseline_m")
+        return evidence, _set(robot, f"sensors.{sensor}.baseline_m", baseline_m / by) if baseline_m else ""
+    factor = by if column == INVERSE else 1.0 / by
+    return evidence, " ".join(corrected(config, "factors", of, factor) for of in _in_log(finding, config))
+
+
+def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, sensor, column = finding.of[:3]
+    bias = _current(config, robot, "sensors", sensor, "bias_m") or 0.0
+    evidence = f"{_lengths(finding)} are {_size(abs(finding.value), 'm')} too {_how(finding)} ({_sure(finding)})"
+    known = column == RANGE and sensor != ALL
+    return evidence, _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value) if known else ""
+
+
+def _lengths(finding: Finding) -> str:
+    return f"{'ranges' if finding.of[2].startswith('range') else 'distances'} of {_sensor(finding)}"
+
+
+def _how(finding: Finding) -> str:
+    return "long" if finding.value > 0 else "short"
+
+
+def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, cures = finding.of[0], []
+    for sensor in (_current(config, robot, "sensors") or {}) if finding.of[1] == ALL else finding.of[1:2]:
+        theta = _current(config, robot, "sensors", sensor, "mount", "theta_rad") or 0.0
+        cures.append(_set(robot, f"sensors.{sensor}.mount.theta_rad", theta - finding.value))
+    return f"bearings of {_sensor(finding)} are off by {_value(finding)} ({_sure(finding)})", " ".join(cures)
+
+
+def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
+    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say ({_sure(finding)})"
+    where = finding.of[:1] if finding.of[1] == ALL else finding.of[:2]
+    return evidence, corrected(config, "shift_s", where, finding.value)
+
+
+def _mount_position(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, sensor, column = finding.of
+    now = _current(config, robot, "sensors", sensor, "mount", column) or 0.0
+    evidence = f"{column} of the mount of {_sensor(finding)} is {figure(now + finding.value)}, not {figure(now)}"
+    return f"{evidence} ({_sure(finding)})", _set(robot, f"sensors.{sensor}.mount.{column}", now + finding.value)
+
+
+def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, column, kind = finding.of
+    little = "little" if finding.value > 0 else "much"
+    verb = "steers" if column == "steering_rad" else "turns" if column.endswith(("_rad", "_radps")) else "drives"
+    each = " for each metre driven" if kind == "per_way" else ""
+    size = _size(abs(finding.value), finding.unit.removesuffix("/m") if each else finding.unit)
+    evidence = f"{column} of {robot} says that it {verb} {size}{each} too {little} ({_sure(finding)})"
+    key = CALIBRATIONS.get((column, kind))
+    cure = _set(robot, f"motion.{key}", abs(finding.value)) if key else f"correct {column} by {_value(finding)}{each}"
+    return evidence, cure
+
+
+def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
+    robot, *of = finding.of
+    if finding.name == "start":
+        if finding.at is not None:
+            return f"{robot} does not start where it is said to: it is {_jump(finding)} from there", ""
+        return f"the start is {figure(finding.value, 2)} times as uncertain as stated", ""
+    if finding.name == "control_sigma":
+        what, path = f"the noise of {robot}'s {of[0] or 'motion'}", ["motion", _sigma_of(of[0])]
+    else:
+        what, path = f"the noise of {robot}.{of[0]} {of[1]}", ["sensors", of[0], _sigma_of(of[1])]
+    now = _current(config, robot, *path)
+    low, high = (max(finding.value + k * 2 * finding.sigma, 0.0) for k in (-1, 1))
+    evidence = f"{what} is {figure(finding.value)} times as large as stated ({figure(low)} to {figure(high)})"
+    evidence += ", which does no harm" if finding.value < 1.0 else ""
+    cure = _set(robot, ".".join(path), now * finding.value) if isinstance(now, float) and now > 0 else ""
+    return evidence, cure
+
+
+def _sigma_of(column: str) -> str:
+    """Return the key of the noise of a column."""
+    return SIGMAS.get(column) or ("sigma_px" if column.endswith("_px") else f"sigma_{column}")
+
+
+def _offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"{finding.name} of {'.'.join(finding.of)} is {_value(finding)} ({_sure(finding)})", ""
+
+
+def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
+    factor = math.sqrt(max((1.0 + finding.value) / (1.0 - finding.value), 1.0))
+    evidence = (
+        f"errors of {_sensor(finding)} {finding.of[2]} last from sighting to sighting (correlation"
+        f" {figure(finding.value, 2)}): they say as little as white noise of {figure(factor, 2)} times the sigma"
+    )
+    return evidence, ""
+
+
+def _moving(finding: Finding, config: Mapping[str, Any]) -> Words:
+    far = f", {figure(finding.moved_m)} m while it was seen" if finding.moved_m is not None else ""
+    evidence = f"landmark {finding.of[0]} moves at {_value(finding)} ({_sure(finding)}){far}: its place is wrong"
+    return evidence, f"leave out {finding.of[0]}"
+
+
+def _landmark_prior(finding: Finding, config: Mapping[str, Any]) -> Words:
+    name = finding.of[0]
+    at = ", ".join(figure(float(x)) for x in (np.zeros(0) if finding.at is None else finding.at))
+    evidence = (
+        f"landmark {name} is {figure(finding.value)} m from where its survey says ({_sure(finding)}):"
+        f" its sightings place it at ({at}) m"
+    )
+    return evidence, f"correct {name} in the file of the survey, or leave it out"
+
+
+def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"{finding.value:.1%} of the observations are far off where their landmark is", ""
+
+
+def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
+    off = f"{finding.value:.1%} of the observations are far off where their landmark is"
+    evidence = f"{off}, and fit another one far more often than by chance"
+    return evidence, UNKNOWN_IDS
+
+
+def _jump(finding: Finding) -> str:
+    """Return how far a jump goes, and how sure that is."""
+    far_m, turn_deg = size_of(np.zeros(3) if finding.at is None else finding.at)
+    return f"{figure(far_m)} m and {figure(turn_deg)} deg ({figure(finding.value, 2)} sigma)"
+
+
+def _others(finding: Finding) -> str:
+    """Return the times of the other jumps of a robot."""
+    times = finding.of[2:]
+    some = ", ".join(times[:LISTED])
+    return f"; {len(times)} more at t={some} s{', ...' if len(times) > LISTED else ''}" if times else ""
+
+
+def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
+    far = f"{finding.of[0]} is moved by about {_jump(finding)} at t={finding.of[1]} s"
+    return f"{far}, and its controls do not show it{_others(finding)}", ""
+
+
+def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
+    by = f"{finding.of[0]} moves by {_jump(finding)} more than its controls say at t={finding.of[1]} s"
+    return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding)}", ""
+
+
+def of_odd_control(finding: Finding, odd: OddControl) -> Words:
+    """Return what a control says that jumps itself, and the limit that leaves it out, where its column has one."""
+    robot = finding.of[0]
+    degrees = odd.column.endswith(("_rad", "_radps"))
+    value = f"{figure(math.degrees(odd.value) if degrees else odd.value)} {'deg' if degrees else ''}".rstrip()
+    evidence = (
+        f"{odd.column} of {robot} is {value} at t={odd.t_s:.1f} s, {figure(odd.times, 2)} times as large as is usual,"
+        f" and it does not move so: its odometry jumps{_others(finding)}"
+    )
+    key = LIMITS.get(odd.column)
+    return (
+        evidence,
+        f"--set robots.{robot}.{key}={figure(odd.usual * MARGIN)}" if key else f"set max_speed_mps of {robot}",
+    )
+
+
+def _mount(finding: Finding, config: Mapping[str, Any]) -> Words:
+    return f"the sensor {_sensor(finding)} is turned by {_value(finding)} ({_sure(finding)})", ""
+
+
+_TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
+    "range_scale": _range_scale,
+    "range_offset": _range_offset,
+    "bearing_offset": _bearing_offset,
+    "time_offset": _time_offset,
+    "mount_position": _mount_position,
+    "odometry_scale": _odometry,
+    "odometry_turn": _odometry,
+    "odometry_offset": _odometry,
+    "steering_offset": _odometry,
+    "correlated_noise": _correlated,
+    "moving_landmark": _moving,
+    "landmark_prior": _landmark_prior,
+    "outliers": _outliers,
+    "wrong_ids": _wrong_ids,
+    "kidnapped": _kidnapped,
+    "odometry_jump": _odometry_jump,
+    "start": _noise,
+    "mount": _mount,
+}

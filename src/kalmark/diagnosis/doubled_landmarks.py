@@ -1,0 +1,202 @@
+"""Sightings of a map in their order: things that are in it twice, or that are not seen again; a robot that was moved.
+
+A residual shows none of them: each landmark fits its own sightings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import chdtr
+
+from kalmark.arrays import Array
+from kalmark.batch.batch_state import Ints
+from kalmark.diagnosis.gross_mistakes import SAME
+from kalmark.geometry.angles import wrap
+from kalmark.results.run import Run
+
+NEIGHBOURS = 3  # of a landmark that may be the same thing
+NEAR_SCANS = 5  # within which both of two landmarks in view would be seen
+SELDOM = 1e-4  # the probability, over all pairs, that two things are never seen together by chance
+LEAST_SEEN = 4  # landmarks that are seen until a robot is moved
+EDGES = 0.05, 0.95  # of the bearings and ranges of all sightings: what is beyond them may be out of view
+TINY = 1e-300
+LATER, FEW_BACK, MOSTLY = 20, 0.25, 0.5  # scans after it, in which few of them are seen, and most landmarks are new
+
+
+class Moment(NamedTuple):
+    """The scan `step`, at `t_s` of the log, at which a robot lost sight of so many landmarks at once.
+
+    `score` is the logarithm of how seldom chance does that in a run; 0 if they are soon seen again, or nothing new is.
+    """
+
+    step: int
+    t_s: float
+    robot: str
+    number: int
+    score: float
+
+
+class Pair(NamedTuple):
+    """A landmark and another one that are one thing; `score` is the logarithm of how seldom chance does that."""
+
+    name: str
+    other: str
+    score: float
+
+
+def split(run: Run) -> list[Pair]:
+    """Return pairs of near landmarks that are one thing.
+
+    They are sighted in turn, within a few scans, but never together.  Of two things, each is seen in a share p of the
+    scans between others in which it is, so both are in p^2 of them.
+    """
+    seen, where = _sightings(run), _places(run)
+    names = [name for name in seen if name in where]
+    if len(names) < 2:
+        return []
+    places = np.array([where[name] for name in names])
+    never = -np.log1p(-(_regularity(seen.values()) ** 2))
+    least, found = np.log(len(names) * NEIGHBOURS / SELDOM), []
+    near = cKDTree(places).query(places, k=range(2, 2 + min(NEIGHBOURS, len(names) - 1)))[1]
+    for a, b in sorted({(min(k, j), max(k, j)) for k, others in enumerate(near.tolist()) for j in others}):
+        score = float(never * _in_turn(seen[names[a]], seen[names[b]]))
+        if score > least:
+            found.append(Pair(names[a], names[b], score))
+    return found
+
+
+class Revisits(NamedTuple):
+    """How often landmarks came into view again as before, of these how often unseen, and since when, s of the log.
+
+    `score` is the logarithm of how seldom chance misses so many.
+    """
+
+    number: int
+    unseen: int
+    since_s: float
+    score: float
+
+
+def unseen(run: Run) -> Revisits | None:
+    """Return how often landmarks were not seen where they were seen before; None if that is seldom, or by chance.
+
+    A thing that stands is seen again from where it was seen, within a share `SAME` of its distance: nothing new hides
+    it there.  It is missed by chance in (1 - p)^n of the visits of n scans, p the share of scans in which it is seen on
+    the others.  One that is in the map twice, or begun where nothing is, is missed.
+    """
+    visits = [visit for robot in run.history.robots if not run.history.in_space for visit in _visits(run, robot)]
+    scans, seen, t_s = np.array(visits).reshape(-1, 3).T
+    missed = seen == 0
+    p = seen.sum() / max(scans[~missed].sum(), 1.0)
+    chance = float(chdtr(2.0 * missed.sum(), 2.0 * float(np.sum((1.0 - p) ** scans)))) if missed.any() else 1.0
+    if chance > SELDOM or missed.mean() <= FEW_BACK:
+        return None
+    return Revisits(len(missed), int(missed.sum()), float(t_s[missed].min()), -math.log(max(chance, TINY)))
+
+
+def _visits(run: Run, robot: str) -> Iterator[tuple[int, int, float]]:
+    """Yield of each time a landmark came into view again the scans in which it was, those that saw it, and the time."""
+    h, where = run.history, _places(run)
+    used = (h.robot[h.step] == robot) & h.fused & np.isin(h.landmark, [*where])
+    if not used.any():
+        return
+    steps = np.unique(h.step[(h.robot[h.step] == robot) & ~h.of_own])
+    poses, scan = h.poses[steps], np.searchsorted(steps, h.step[used])
+    far, bearing = _view(poses[scan], np.array([where[name] for name in h.landmark[used].tolist()]))
+    (low, high), most = np.quantile(bearing, EDGES), np.quantile(far, EDGES[1])
+    for name, place in where.items():
+        mine = np.unique(scan[h.landmark[used] == name])
+        if len(mine) < LEAST_SEEN:
+            continue
+        apart, k = cKDTree(poses[mine, :2]).query(poses[:, :2])
+        r, b = _view(poses, place)
+        inside = (apart < SAME * r[mine[k]]) & (b > low) & (b < high) & (r < most)
+        inside[: mine[0]] = False
+        there = np.union1d(mine, np.flatnonzero(inside))
+        for visit in np.split(there, np.flatnonzero(np.diff(there) > LATER) + 1)[1:]:
+            seen = int(np.isin(visit, mine).sum())
+            if seen or len(visit) >= LEAST_SEEN:
+                yield len(visit), seen, float(h.t_ns[steps[visit[0]]]) * 1e-9
+
+
+def _view(poses: Array, places: Array) -> tuple[Array, Array]:
+    """Return ranges and bearings (K,) of places (K, 2), or of one, from poses (K, 3)."""
+    v = places - poses[:, :2]
+    return np.linalg.norm(v, axis=1), np.asarray(wrap(np.arctan2(v[:, 1], v[:, 0]) - poses[:, 2]))
+
+
+def spacing(run: Run) -> float:
+    """Return the median distance of a landmark to the next one, m."""
+    places = np.array([*_places(run).values()])
+    return float(np.median(cKDTree(places).query(places, k=[2])[0])) if len(places) > 1 else 0.0
+
+
+def _places(run: Run) -> dict[str, Array]:
+    """Return the positions (2,) or (3,) of the landmarks that have one."""
+    d, marks = 3 if run.landmarks.in_space else 2, run.landmarks
+    where = {str(id_): mean[:d] for id_, mean in zip(marks.ids, marks.means, strict=True)}
+    return {name: place for name, place in where.items() if np.isfinite(place).all()}
+
+
+def _sightings(run: Run) -> dict[str, Ints]:
+    """Return the scans (k,) of two landmarks or more in which each landmark was seen that ids do not tell."""
+    h = run.history
+    used = (h.outcome == "associated") & (h.id == "")
+    used &= np.bincount(h.step[used], minlength=len(h.t_ns))[h.step] > 1
+    if not used.any():
+        return {}
+    order = np.argsort(h.landmark[used], kind="stable")
+    names, first = np.unique(h.landmark[used][order], return_index=True)
+    return dict(zip(names.tolist(), np.split(h.step[used][order], first[1:]), strict=True))
+
+
+def _regularity(all_scans: Iterable[Ints]) -> float:
+    """Return the share of scans in which a landmark is seen, of those between two in which it is."""
+    gaps = np.concatenate([np.diff(scans) for scans in all_scans])
+    there, left_out = float((gaps == 1).sum()), float((gaps == 2).sum())
+    return there / (there + left_out + 1.0)
+
+
+def _in_turn(a: Ints, b: Ints) -> int:
+    """Return how many sightings of two landmarks alternate, 0 if they were ever seen together."""
+    scans, of = np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)])
+    order = np.argsort(scans, kind="stable")
+    gaps, changes = np.diff(scans[order]), np.diff(of[order]) != 0
+    return 0 if (gaps == 0).any() else int((changes & (gaps <= NEAR_SCANS)).sum())
+
+
+def vanished(run: Run) -> list[Moment]:
+    """Return when of the landmarks that a robot saw until then none is seen any more, which no ids say.
+
+    Those of the last scans are compared with those of the next ones.  Of such landmarks a share p is seen again, so by
+    chance (1 - p)^n of n vanish together.
+    """
+    h, found = run.history, list[Moment]()
+    used = (h.id == "") & np.isin(h.outcome, ("associated", "new"))
+    names, first = np.unique(h.landmark[used], return_index=True)
+    begun = dict(zip(names.tolist(), h.step[used][first].tolist(), strict=True))
+    for robot in dict.fromkeys(h.robot[h.step[used]].tolist()):
+        steps, mine = np.flatnonzero(h.robot == robot), used & (h.robot[h.step] == robot)
+        seen: list[set[str]] = [set() for _ in steps]
+        for k, name in zip(np.searchsorted(steps, h.step[mine]).tolist(), h.landmark[mine].tolist(), strict=True):
+            seen[k].add(name)
+        moments, total, again = list[tuple[int, set[str]]](), 1, 0
+        for k in range(1, len(steps)):
+            before, after = set().union(*seen[max(k - NEAR_SCANS, 0) : k]), set().union(*seen[k : k + NEAR_SCANS])
+            if len(before) >= LEAST_SEEN:
+                total, again = total + len(before), again + len(before & after)
+                if after and not before & after:
+                    moments.append((k, before))
+        for k, before in moments:
+            later = set().union(*seen[k : k + LATER])
+            anew = sum(begun[name] >= steps[k] for name in later)
+            gone = len(before & later) <= FEW_BACK * len(before) and anew >= max(LEAST_SEEN, MOSTLY * len(later))
+            score = -len(before) * np.log1p(-again / total) - np.log(len(steps) / SELDOM)
+            t_s = float(h.t_ns[steps[k]]) * 1e-9
+            found.append(Moment(int(steps[k]), t_s, robot, len(before), float(score) if gone else 0.0))
+    return found

@@ -1,0 +1,167 @@
+"""The systematic errors that sensors and controls may have: what one unit of each adds to the data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.batch.batch_state import POSES, Ints, State
+from kalmark.batch.problem import Factor
+from kalmark.diagnosis.linear import Linear
+from kalmark.geometry.angles import rotation
+from kalmark.geometry.rotations import matrix
+from kalmark.results.measures import pose_error
+
+SLOW_S = 1e-3  # least time between two poses
+LENGTHS = ("range", "distance")  # how columns of lengths begin
+ALL = "all sensors"
+SHARED = ("range_scale", "range_offset", "bearing_offset", "time_offset")  # errors of several sensors
+
+Where = tuple[str, str]
+
+
+class Column(NamedTuple):
+    """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,)."""
+
+    name: str
+    of: tuple[str, ...]
+    unit: str
+    Z: Array
+    W: Array
+
+    @property
+    def group(self) -> tuple[str, ...]:
+        """Robot, sensor and column, or robot and column of its controls: errors of the same column share it."""
+        return self.of[:2] if self.W.any() else self.of
+
+
+def columns_of(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: Array) -> list[Column]:
+    """Return the systematic errors that data may have.
+
+    `sensors` are the columns that each sensor measures, `rates` (n, q) the velocities of the poses, in the world.
+    """
+    found = [*_of_sensors(linear, sensors, rates), *_of_controls(linear)]
+    return [column for column in found if np.isfinite(column.Z).all() and (column.Z.any() or column.W.any())]
+
+
+def of_all_sensors(columns: list[Column]) -> list[Column]:
+    """Return the errors that all sensors of a robot may share, where it has several: one laser, one clock."""
+    found: dict[tuple[str, str], list[Column]] = {}
+    for column in (c for c in columns if c.name in SHARED):
+        found.setdefault((column.name, column.of[0]), []).append(column)
+    return [
+        Column(name, (robot, ALL, *dict.fromkeys(x for c in same for x in c.of[2:])), same[0].unit,
+               sum((c.Z for c in same), start=np.zeros_like(same[0].Z)), same[0].W)
+        for (name, robot), same in found.items() if len(same) > 1
+    ]  # fmt: skip
+
+
+def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: Array) -> list[Column]:
+    """Return the systematic errors of the sensors.  Landmarks and robots that one sensor observes share its errors."""
+    factors, nothing = linear.problem.factors, np.zeros(len(linear.at.w))
+    found: dict[tuple[str, ...], Column] = {}
+    for f, factor in enumerate(factors):
+        names, p = sensors.get(factor.sensor, ()), factor.R.shape[1]
+        if len(names) != p:
+            continue
+        for name, of, unit, part in _of_sensor(factor, linear.state, names, rates):
+            parts = [np.zeros(other.R.shape[:2]) for other in factors]
+            parts[f] = part
+            have, Z = found.get((name, *of)), linear.whitened(parts)
+            found[name, *of] = Column(name, of, unit, Z if have is None else have.Z + Z, nothing)
+    return [*found.values()]
+
+
+def _of_sensor(
+    factor: Factor, state: State, names: tuple[str, ...], rates: Array
+) -> Iterator[tuple[str, tuple[str, ...], str, Array]]:
+    """Yield the name, the place and the unit of each error of a sensor, and what it adds to its innovations (K, p)."""
+    z, E = factor.term.at(state)
+    e, one = factor.y[:, : z.shape[1]] - z, np.ones_like(z)  # of a wall, not its ends
+    longer = _longer(names, e)
+    for c, name in enumerate(names):
+        of, mine = (*factor.sensor, name), np.eye(len(names))[c]
+        if name.startswith(LENGTHS) and name.endswith("_m"):
+            yield "range_scale", of, "", longer * mine
+            yield "range_offset", of, "m", one * mine
+        elif name.endswith("_rad"):
+            offset = "bearing_offset" if name == "normal_rad" else f"{name.removesuffix('_rad')}_offset"
+            yield offset, of, "rad", one * mine
+        elif longer[:, c].any() and not longer[:, :c].any():  # one scale of all columns
+            scaled = [other for k, other in enumerate(names) if longer[:, k].any()]
+            yield "range_scale", (*factor.sensor, *scaled), "", longer
+    moving, first = np.zeros_like(z), 0
+    for block in factor.term.blocks:
+        dof = block.space.dof
+        if block.group == POSES:
+            moving += np.einsum("kij,kj->ki", E[:, :, first : first + dof], rates[block.rows, :dof])
+        first += dof
+    yield "time_offset", factor.sensor, "s", moving
+    observer, d = factor.term.blocks[0], state.d
+    if observer.group == POSES:
+        axes = _axes(state.groups[POSES][observer.rows])
+        for k, name in enumerate(("x_m", "y_m", "z_m")[:d]):
+            yield "mount_position", (*factor.sensor, name), "m", np.einsum("kij,kj->ki", E[:, :, :d], axes[:, :, k])
+
+
+def _axes(poses: Array) -> Array:
+    """Return the axes (K, d, d) of robots at poses (K, 3) or (K, 7), in the world."""
+    turns = map(rotation, poses[:, 2].tolist()) if poses.shape[1] == 3 else map(matrix, poses[:, 3:])
+    return np.array([*turns])
+
+
+def _longer(names: tuple[str, ...], e: Array) -> Array:
+    """Return by how much measurements (K, p), expected as e, change for each unit by which distances are scaled."""
+    out = np.zeros_like(e)
+    for c, name in enumerate(names):
+        if name in ("x_m", "y_m", "z_m") or (name.startswith(LENGTHS) and name.endswith("_m")):
+            out[:, c] = e[:, c]
+        elif name == "rho_per_m":
+            out[:, c] = -e[:, c]
+        elif name == "ur_px":  # the disparity is inverse to the depth
+            out[:, c] = e[:, names.index("ul_px")] - e[:, c]
+    return out
+
+
+def _of_controls(linear: Linear) -> Iterator[Column]:
+    """Yield the systematic errors of the controls.
+
+    A scale is that of the control as estimated.  The measured one has its noise in it: its scale would come out short.
+    """
+    motions, nothing = linear.problem.motions, np.zeros(len(linear.at.z))
+    e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds)
+    for k, error in enumerate(motions.errors):
+        turns = error.column.endswith(("_rad", "_radps"))
+        name = "odometry_turn" if turns else "odometry_scale" if error.kind == "scale" else "odometry_offset"
+        if error.column == "steering_rad":
+            name = "steering_offset"
+        W = motions.systematic[:, k]
+        if error.kind == "scale":
+            W = W + linear.root @ np.where(kinds == f"{error.robot}.{error.column}", e, 0.0)
+        yield Column(name, (error.robot, error.column, error.kind), error.unit, nothing, W)
+
+
+def rates_of(linear: Linear, t_ns: Ints) -> Array:
+    """Return the velocities (n, q) of the poses at the scans, at `t_ns` (S,), of their robots and those they observe.
+
+    They are in the world, from the pose before to the one after; zero of all other poses.
+    """
+    poses, robots = linear.state.groups[POSES], np.array(linear.problem.robots)
+    t, out = np.full(len(poses), np.nan), np.zeros((len(poses), linear.state.spaces[POSES].dof))
+    own = linear.problem.nodes
+    t[own] = t_ns * 1e-9
+    for observer, *others in (factor.term.blocks for factor in linear.problem.factors if factor.sensor[1]):
+        for other in others:
+            if observer.group == other.group == POSES:
+                t[other.rows] = t[observer.rows]
+    t[own] = t_ns * 1e-9  # a robot that did not move since then has the pose of its own scan
+    for robot in dict.fromkeys(linear.problem.robots):
+        node = np.flatnonzero((robots == robot) & np.isfinite(t))
+        node = node[np.argsort(t[node], kind="stable")]  # others may have observed it out of order
+        node = node[np.diff(t[node], prepend=-np.inf) > SLOW_S]  # several scans may be at one pose
+        after = t[node[2:]] - t[node[:-2]]
+        out[node[1:-1]] = pose_error(poses[node[:-2]], poses[node[2:]]) / after[:, None]
+    return out

@@ -1,0 +1,284 @@
+"""Causes of misfits of a sensor of the state: its noise, its mount, its constants, the signs of its columns.
+
+The log is filtered again with each of them changed, and the likelihoods of all innovations are compared.  A mount or a
+constant is put into the map with a sigma as large as the innovations: the filter says what it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from kalmark.arrays import Array
+from kalmark.diagnosis.cause_search import LEAST_GAIN
+from kalmark.diagnosis.cause_texts import corrected
+from kalmark.diagnosis.gross_mistakes import ALIKE, FITS, MISFIT, MOST, beginning, filtered
+from kalmark.diagnosis.mistakes import Mistake, Where, measured, section_of, stated, with_value
+from kalmark.events import Event
+from kalmark.geometry.gaussian import quantile
+from kalmark.logs.log import Log
+from kalmark.logs.progress import track
+from kalmark.models.protocols import POSE
+from kalmark.models.state_sensors import StateSensor
+from kalmark.results.figure_texts import figure
+from kalmark.results.history import Ints
+from kalmark.results.run import Run
+from kalmark.results.self_calibration import mount_figures
+from kalmark.results.warnings import CHANCE, NOTICES
+
+SCANS = 800  # of the log are filtered again
+MOST_CAUSES = 3
+ROUNDS, SAME = 3, 0.1  # in which a noise is found, and the share by which the last may change it
+WIDER = 2.0  # times larger is a sigma of a constant than the one that is stated, else it is tried already
+SIGMA_SCALE, MOST_SCALE = "sigma_scale", 0.5  # its key, and its sigma where the scale is sought
+SCALES = (0.5, 0.7, 1.4, 2.0)  # of a sensor that has no scale in the map
+RATES = ("w_radps", "wx_radps")
+SIGMA, SIGN, SCALE, CONSTANT, ARM = "reading_sigma", "reading_sign", "reading_scale", "reading_offset", "mount_position"
+SWAPPED = "swapped_columns"
+NAMES = (SIGMA, SIGN, SCALE, CONSTANT, ARM, SWAPPED)
+
+
+Told = Callable[["Filtered"], tuple[str, str]]
+
+
+class Filtered(NamedTuple):
+    """A run, and of each of its observations d2, at most `MOST` a number, log det Z, and how many numbers it has."""
+
+    run: Run
+    d2: Array
+    logdet: Array
+    dof: Array
+
+    def of(self, where: Where) -> Ints:
+        """Return the rows of a sensor that were judged."""
+        h = self.run.history
+        return np.flatnonzero((h.robot[h.step] == where[0]) & (h.sensor == where[1]) & np.isfinite(self.d2))
+
+    def sensors(self) -> list[Where]:
+        """Return the sensors of the state that made readings which were judged."""
+        h = self.run.history
+        mine = h.of_own & np.isfinite(self.d2)
+        both = {*zip(h.robot[h.step[mine]].tolist(), h.sensor[mine].tolist(), strict=True)}
+        return sorted(both)
+
+    def tried(self) -> list[Where]:
+        """Return those of them that have a configuration, but not what notices a rest."""
+        robots = self.run.final_slam().robots
+        built_in = (of for of in self.sensors() if isinstance(robots[of[0]].sensors[of[1]].sensor, StateSensor))
+        return [of for of in built_in if self.run.section(*of).get("type") != NOTICES]
+
+    def mean(self, where: Where) -> float:
+        """Return d2 per degree of freedom of the readings of a sensor."""
+        mine = self.of(where)
+        return float(self.d2[mine].sum() / max(self.dof[mine].sum(), 1))
+
+    def off(self) -> list[Where]:
+        """Return the sensors of the state whose readings do not fit: that is no chance."""
+        dof = {where: int(self.dof[self.of(where)].sum()) for where in self.sensors()}
+        return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
+
+
+def filtered_with(config: Mapping[str, Any], log: Log, events: list[Event]) -> Filtered | None:
+    """Return how events fit under a configuration, None if they are refused."""
+    run = filtered(config, log, events)
+    return None if run is None else judged(run)
+
+
+def judged(run: Run) -> Filtered:
+    """Return how the observations of a run fit."""
+    h = run.history
+    known = np.isfinite(h.z)
+    dof = known.sum(axis=1)
+    logdet, d2 = np.full(len(dof), np.nan), np.minimum(h.d2, MOST * dof)
+    for m in np.unique(dof[np.isfinite(d2) & (dof > 0)]).tolist():
+        rows = np.isfinite(d2) & (dof == m)
+        logdet[rows] = np.linalg.slogdet(h.Z[rows][:, :m, :m])[1]
+    return Filtered(run, np.where(np.isfinite(logdet), d2, np.nan), logdet, dof)
+
+
+def gained(before: Filtered, after: Filtered, scaled: Where | None = None) -> float:
+    """Return the logarithm of the likelihood ratio of two runs of the same events.
+
+    Readings that are `scaled` do not count themselves: the filter takes the noise of a control for its own, so that
+    their likelihood says nothing of their size.
+    """
+    if len(before.d2) != len(after.d2):
+        return -math.inf
+    both = np.isfinite(before.d2) & np.isfinite(after.d2)
+    both[before.of(scaled) if scaled is not None else []] = False
+    return 0.5 * float((before.d2 + before.logdet - after.d2 - after.logdet)[both].sum())
+
+
+class _Sensor:
+    """A sensor of the state, and the trials with it: events under a configuration, filtered as they are."""
+
+    def __init__(self, as_it_is: Filtered, config: Mapping[str, Any], log: Log, events: list[Event], of: Where) -> None:
+        self.as_it_is, self.config, self.log, self.events, self.where = as_it_is, config, log, events, of
+        run = as_it_is.run
+        self.sensor: Any = run.final_slam().robots[of[0]].sensors[of[1]].sensor
+        self.space = run.history.in_space
+        self.path = ("robots", section_of(config, of[0]), "sensors", of[1])
+        self.size = float(np.sqrt(np.nanmax(np.mean(run.history.z[as_it_is.of(of)] ** 2, axis=0))))
+
+    def trials(self) -> Iterator[Mistake | None]:
+        """Yield of each what it was, None where the log is not likelier without it, or its readings do not fit."""
+        yield self.noise()
+        yield from self.constants()
+        yield from self.signs()
+        yield self.scale()
+
+    def key(self, name: str) -> str:
+        return f"robots.{self.where[0]}.sensors.{self.where[1]}.{name}"
+
+    def cured(self, name: str, value: float) -> str:
+        return f"--set {self.key(name)}={figure(value)}"
+
+    def trial(
+        self, name: str, config: Mapping[str, Any], told: Told, by: Array | None = None,
+        change: Callable[[Array], Array] | None = None,
+    ) -> Mistake | None:  # fmt: skip
+        """Return a mistake with its gain, None where the log does not fit without it."""
+        if by is not None:
+            change = partial(np.multiply, by)
+        turned = None if change is None else measured({self.where}, change)
+        events = self.events if turned is None else [turned(e) for e in self.events]
+        after = filtered_with(config, self.log, events)
+        if after is None or after.mean(self.where) > FITS:
+            return None
+        scaled = by is not None and bool((np.abs(by) != 1.0).any())
+        gain = gained(self.as_it_is, after, self.where if scaled else None)
+        return Mistake(name, *told(after), config, turned, gain) if gain > LEAST_GAIN else None
+
+    # ------------------------------------------------------------------ each kind
+    def noise(self) -> Mistake | None:
+        """Return that it has more noise than stated: so many times that the innovations are as large as they say."""
+        keys = [k for k in dict.fromkeys(self.sensor.sigmas) if isinstance(stated(self.config, (*self.path, k)), float)]
+        now, times, config = self.as_it_is, 1.0, self.config
+        for _ in range(ROUNDS):
+            mine = now.of(self.where)
+            m = int(now.dof[mine].max(initial=1))
+            middle = float(np.median(now.run.history.d2[mine])) / float(chdtri(m, 0.5))
+            step = math.sqrt(max(middle if times == 1.0 else now.mean(self.where), 1e-6))
+            times *= step
+            config = self.config
+            for k in keys:
+                config = with_value(config, (*self.path, k), stated(self.config, (*self.path, k)) * times)
+            found = filtered_with(config, self.log, self.events)
+            if found is None:
+                return None
+            now = found
+            if abs(step - 1.0) < SAME:
+                break
+        what = f"readings of {'.'.join(self.where)} fit if their noise is {figure(times, 2)} times as large as stated"
+        cure = " ".join(self.cured(k, stated(config, (*self.path, k))) for k in keys)
+        return self.trial(SIGMA, config, lambda _: (what, cure)) if keys else None
+
+    def constants(self) -> Iterator[Mistake | None]:
+        """Yield that a constant of it is not as stated, or its mount: each as the filter finds it."""
+        constants = [*self.sensor.constants]
+        if stated(self.config, (*self.path, SIGMA_SCALE)) is not None:
+            constants.append(("scale", SIGMA_SCALE, ""))
+        for key in dict.fromkeys(key for _, key, _ in constants if key):
+            names = [name for name, of, _ in constants if of == key]
+            sigma = {"scale": MOST_SCALE, "declination_rad": math.pi}.get(names[0], WIDER * self.size)
+            if float(stated(self.config, (*self.path, key)) or 0.0) * WIDER < sigma:
+                yield self.in_map(SCALE if names == ["scale"] else CONSTANT, (key,), sigma, names)
+        if self.sensor.views == POSE and self.sensor.columns[0] == "x_m":
+            key = "sigma_position_m" if self.space else "sigma_xy_m"
+            names = ["x_m", "y_m", "z_m"] if self.space else ["x_m", "y_m"]
+            sigma = WIDER * self.size
+            if float(np.max(stated(self.config, (*self.path, "mount", key)) or 0.0)) * WIDER < sigma:
+                yield self.in_map(ARM, ("mount", key), sigma, names)
+
+    def in_map(
+        self, name: str, key: tuple[str, ...], sigma: float, names: list[str], by: Array | None = None,
+        also: tuple[str, str] = ("", ""),
+    ) -> Mistake | None:  # fmt: skip
+        """Return that numbers of a sensor are not as stated, which are put into the map with a sigma."""
+        config, path = with_value(self.config, (*self.path, *key), sigma), key[:-1]
+
+        def told(after: Filtered) -> tuple[str, str]:
+            found = {m.name: mount_figures(m) for m in after.run.history.mounts}[".".join(self.where)]
+            old = [float(stated(self.config, (*self.path, *path, n)) or (n == "scale")) for n in names]
+            values = [
+                f"{n} {figure(found[n])} ± {figure(found[f'sigma_{n}'], 2)} instead of {figure(o)}"
+                for n, o in zip(names, old, strict=True)
+            ]
+            cures = [self.cured(".".join((*path, n)), found[n]) for n in names]
+            what = f"readings of {'.'.join(self.where)} fit with {also[0]}{', '.join(values)}"
+            return what, " ".join([*([also[1]] if also[1] else []), *cures])
+
+        return self.trial(name, config, told, by)
+
+    def signs(self) -> Iterator[Mistake | None]:
+        """Yield that columns of it have the wrong sign, or that the first two are exchanged."""
+        columns, of = tuple(self.sensor.columns), ".".join(self.where)
+        for names in dict.fromkeys([*((c,) for c in columns), columns]):
+            by = np.array([-1.0 if c in names else 1.0 for c in columns])
+            what = f"the sign of {', '.join(names)} changed"
+            cure = " ".join(corrected(self.config, "factors", (*self.where, c), -1.0) for c in names)
+            if columns == ("heading_rad",):  # clockwise headings count from another direction, too
+                key = ("sigma_declination_rad",)
+                yield self.in_map(SIGN, key, math.pi, ["declination_rad"], by, (f"{what}, and ", cure))
+            else:
+                told = f"readings of {of} fit with {what}", cure
+                yield self.trial(SIGN, self.config, partial(_same, told), by)
+        if columns[:2] == ("x_m", "y_m"):
+            order, exchanged = [1, 0, *range(2, len(columns))], f"readings of {of} fit with x_m and y_m exchanged"
+            both = exchanged, "exchange the columns x_m and y_m"
+            yield self.trial(SWAPPED, self.config, lambda _: both, None, lambda y: y[:, order])
+
+    def scale(self) -> Mistake | None:
+        """Return that rates are so many times too large, of a sensor that has no scale: the likeliest of `SCALES`."""
+        if self.sensor.columns[0] not in RATES:
+            return None
+
+        def tried(by: float) -> Mistake | None:
+            what = f"readings of {'.'.join(self.where)} fit if they are multiplied by {figure(by)}"
+            cure = " ".join(corrected(self.config, "factors", (*self.where, c), by) for c in self.sensor.columns)
+            factors = np.full(len(self.sensor.columns), by)
+            return self.trial(SCALE, self.config, lambda _: (what, cure), factors)
+
+        best: tuple[float, Mistake] | None = None
+        step: tuple[float, ...] = SCALES
+        for n in range(3):
+            some = [(f, m) for f in step if (m := tried(f)) is not None]
+            best = max([*some, *([best] if best else [])], key=lambda one: one[1].gain, default=None)
+            if best is None:
+                return None
+            near = 1.0 + 0.2 * 0.5**n
+            step = (best[0] / near, best[0] * near)
+        return best[1] if best else None
+
+
+def _same(told: tuple[str, str], _: Filtered) -> tuple[str, str]:
+    return told
+
+
+def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], Filtered | None]:
+    """Return what is wrong with sensors of the state of a run that does not fit, and how the log fits without it.
+
+    Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.
+    """
+    if not run.config.get("robots") or run.stopped:
+        return [], None
+    config, events, found = dict(run.config), beginning(run, log, SCANS), list[Mistake]()
+    now = filtered_with(config, log, events)
+    while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
+        of = [_Sensor(now, config, log, events, where) for where in now.tried()]
+        trials = track((m for sensor in of for m in sensor.trials()), "sensors of the state, tried", show=progress)
+        tried = sorted((m for m in trials if m is not None), key=lambda m: -m.gain)
+        if not tried:
+            break
+        first, *others = tried
+        alike = "; or: ".join(m.evidence for m in others if m.gain > ALIKE * first.gain)
+        more = f"; the log cannot tell this from: {alike}" if alike else ""
+        found.append(first._replace(evidence=first.evidence + more))
+        config, events = dict(first.config), [*map(first.change, events)] if first.change else events
+        now = filtered_with(config, log, events)
+    return found, now

@@ -1,0 +1,133 @@
+"""The landmarks of a scan without ids where each observation can be of one landmark only, in one compiled call."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array, Index
+from kalmark.compiled import compiled
+from kalmark.filter.corrections import Map
+from kalmark.filter.kernels import cholesky_inverse
+from kalmark.filter.nearest_blocks import Sorts, distance, paired, wanted
+from kalmark.filter.observed_block import head_sizes, innovation, observed_block
+from kalmark.models.observe import linearize
+
+Seen = tuple[int, int, int, Array, Array]  # slots of robot and mount, numbers of a landmark, y (K, m), R (K, p, p)
+Asked = tuple[Sorts, Array, int, float, float]  # wanted sorts, places, most, farther, gate: see `nearest`
+
+
+class Nearest(NamedTuple):
+    """The block nearest to each observation: its slot (K,), d2 (K,) and `sigma` (K,) [m], that of their distance.
+
+    No other is in question within `limit` (K,) [m] of where the observation seems to be.  All pairs that were compared:
+    `rows` and `numbers` (M,), their d2 `compared` (M,), and of these numbers the `slots` (L,) and `places` (L, n).
+    """
+
+    at: Index
+    d2: Array
+    sigma: Array
+    limit: Array
+    rows: Index
+    numbers: Index
+    compared: Array
+    slots: Index
+    places: Array
+
+
+@compiled
+def nearest(
+    model: Any, map_: Map, scan: Seen, slots: Index, asked: Asked
+) -> tuple[bool, tuple[Index, Array, Array, Array, Index, Index, Array, Index, Array]]:  # fmt: skip
+    """Return the `Nearest` of a scan, and whether each observation is of another block and within the gate on d2.
+
+    `slots` are those by which the blocks of the map are to be named, -1 for none; wanted are those of some `sorts`.  Of
+    an observation, which seems to be at its p (K, n), the `most` nearest in metres are compared, within `farther` times
+    the least distance.
+    """
+    x, P, _n, blocks, atoms, _axes, _ways = map_
+    robot, mount, d, y, R = scan
+    sorts, p, most, farther, gate = asked
+    here, places = wanted(x, blocks, slots, sorts, p.shape[1])
+    rows, numbers, used = paired(p, places, most, farther)
+    named, l = np.empty(len(used), np.int64), np.empty((len(used), p.shape[1]))
+    for i in range(len(used)):
+        named[i] = slots[here[used[i]]]
+        for j in range(p.shape[1]):
+            l[i, j] = places[used[i], j]
+    own, y_own, R_own = _of_pairs(rows, numbers, here, used, y, R)
+    index, _table, mean = observed_block(x, blocks, atoms, robot, mount, own, d)
+    head = head_sizes(blocks, atoms, robot, mount)[1]
+    _e, z, E_h, E_l = linearize(model, mean[:head], mean[head:].reshape(len(rows), d), y_own)
+    Z, compared, _valid = innovation(P, index, E_h, E_l, R_own, z)
+    best, limit = _best(p, rows, numbers, compared, l, most, farther)
+    at, d2, sigma, clear = np.full(len(p), -1), np.full(len(p), np.inf), np.full(len(p), np.inf), True
+    for k in range(len(p)):
+        if best[k] >= 0:
+            at[k], d2[k] = named[numbers[best[k]]], compared[best[k]]
+        clear = clear and d2[k] <= gate and at[k] not in at[:k]
+        if clear:
+            sigma[k] = _sigma(E_l[best[k]], Z[best[k]])
+    return clear, (at, d2, sigma, limit, rows, numbers, compared, named, l)
+
+
+@compiled
+def _of_pairs(
+    rows: Index, numbers: Index, here: Index, used: Index, y: Array, R: Array
+) -> tuple[Index, Array, Array]:  # fmt: skip
+    """Return the blocks (M,) of pairs, their measurements (M, m) and noises (M, p, p)."""
+    own, p = np.empty(len(rows), np.int64), R.shape[1]
+    y_own, R_own = np.empty((len(rows), y.shape[1])), np.empty((len(rows), p, p))
+    for m in range(len(rows)):
+        own[m] = here[used[numbers[m]]]
+        for a in range(y.shape[1]):
+            y_own[m, a] = y[rows[m], a]
+        for a in range(p):
+            for b in range(p):
+                R_own[m, a, b] = R[rows[m], a, b]
+    return own, y_own, R_own
+
+
+@compiled
+def _best(
+    p: Array, rows: Index, numbers: Index, d2: Array, places: Array, most: int, farther: float
+) -> tuple[Index, Array]:  # fmt: skip
+    """Return the pair (K,) of least d2 of each observation, -1 for none, and how far off others may be (K,)."""
+    best, pairs = np.full(len(p), -1), np.zeros(len(p), np.int64)
+    limit, least, farthest = np.empty(len(p)), np.full(len(p), np.inf), np.zeros(len(p))
+    for m in range(len(rows)):
+        k, gap = rows[m], distance(p[rows[m]], places[numbers[m]])
+        least[k], farthest[k], pairs[k] = min(least[k], gap), max(farthest[k], gap), pairs[k] + 1
+        if d2[m] < (np.inf if best[k] < 0 else d2[best[k]]):
+            best[k] = m
+    for k in range(len(p)):
+        limit[k] = farthest[k] if pairs[k] == most else farther * least[k]
+    return best, limit
+
+
+@compiled
+def _sigma(E_l: Array, Z: Array) -> float:
+    """Return the root of the trace of (E_l' Z^-1 E_l)^-1, inf where a measurement does not determine a place."""
+    p, d = E_l.shape
+    M, positive = cholesky_inverse(Z)
+    if not positive:
+        return np.inf
+    A, I = np.zeros((p, d)), np.zeros((d, d))
+    for a in range(p):
+        for c in range(d):
+            for b in range(a + 1):
+                A[a, c] += M[a, b] * E_l[b, c]
+    for c in range(d):
+        for b in range(d):
+            for a in range(p):
+                I[c, b] += A[a, c] * A[a, b]
+    M, positive = cholesky_inverse(I)
+    if not positive:
+        return np.inf
+    trace = 0.0
+    for a in range(d):
+        for b in range(a + 1):
+            trace += M[a, b] ** 2
+    return math.sqrt(trace)

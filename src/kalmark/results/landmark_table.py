@@ -1,0 +1,360 @@
+"""The places that landmarks are at: Euclidean points, the endpoints of lines, the poses of tags, with covariances.
+
+A place is a row of numbers, and its covariance that of its error:
+
+==========  ==============================  ==========================  =====
+kind        place                           error                       sizes
+==========  ==============================  ==========================  =====
+point       x y z                           x y z                       3, 3
+line        both endpoints, x y z x2 y2 z2  the same                    6, 6
+wall        both endpoints, x y x2 y2       the same                    4, 4
+tag         x y z qx qy qz qw               x y z, rotation vector      7, 6
+==========  ==============================  ==========================  =====
+
+Whatever else a landmark is in the map (inverse depth, homogeneous, Pluecker), its model says where that is: by `place`,
+lines by `endpoints` at the abscissas of their ends (`kalmark.models.protocols.Placed`, `Segmented`).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations_with_replacement
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from kalmark.arrays import Array
+from kalmark.declare import is_own
+from kalmark.errors import KalmarkError, RunError
+from kalmark.events import Id
+from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
+from kalmark.models.landmarks import Point2D, PointHeight2D, Wall2D
+from kalmark.models.protocols import Landmark, Segmented, place_of
+from kalmark.results.gauge import Datum, generators
+from kalmark.results.history import Ints, as_id, padded_all
+
+if TYPE_CHECKING:
+    from kalmark.slam.slam import Slam
+
+POINT, WALL, LINE, TAG = 3, 4, 6, 7
+DATUM = 128  # landmarks
+UNSEEN = "not seen again"
+TINY = 1e-30
+EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
+# kinds whose state is their place; what is not (inverse depth, say) is not well known yet
+EUCLIDEAN = ("", "point", "point3", "point_signature", "point_height", "tag")
+_POINT = ("x_m", "y_m", "z_m")
+_PLANE = {"point_signature": (*_POINT[:2], "signature"), "point_height": _POINT, "wall": ("x_m", "y_m", "x2_m", "y2_m")}
+_LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
+_TAG = (*_POINT, "qx", "qy", "qz", "qw")
+_SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
+_ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
+
+
+def places(
+    model: Landmark | None, means: Array, covariances: Array, ends: Sequence[Array | None]
+) -> tuple[Array, Array] | None:
+    """Return the places and covariances of the states (K, n) of landmarks of one model.
+
+    `ends` (K of (2,)) are the abscissas of lines' ends.  The pose of a tag and a point of the plane, with its
+    signature or height, are their own places.  None if a model does not say where it is.
+    """
+    if model is None or model.space.kinds == SE3.kinds or isinstance(model, Point2D):
+        return means, covariances
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if isinstance(model, Segmented):
+            p, P_l = model.endpoints(means, np.array([model.first_ends if t is None else t for t in ends]))
+            p, P_l = p.reshape(len(means), -1), P_l.reshape(len(means), p[0].size, -1)
+        elif (found := place_of(model, means)) is not None:
+            p, P_l = found
+        else:
+            return None
+        covariances = P_l @ covariances @ P_l.swapaxes(1, 2)
+    return np.where(np.isfinite(p), p, np.inf), np.where(np.isfinite(covariances), covariances, np.inf)
+
+
+class Shapes(NamedTuple):
+    """What is to be drawn of a map: Gaussian points (of lines both endpoints), `lines` (L, 2, d) and `tags` (T, 7).
+
+    Of the points: which landmark each belongs to (K,), `means` (K, d), `covariances` (K, d, d), and as its `group`
+    whether it is of a Euclidean landmark (0), another (1) or a line (2).
+    """
+
+    row: Ints
+    means: Array
+    covariances: Array
+    lines: Array
+    tags: Array
+    group: Ints
+
+
+def shapes(means: Array, covariances: Array, kinds: Sequence[str], d: int = 3) -> Shapes:
+    """Sort the places (K, n) of landmarks, padded with NaN, and covariances (K, q, q), by what they are.
+
+    In the plane (d = 2) all are points or walls.
+    """
+    size = (~np.isnan(means)).sum(axis=1)
+    lines, tags = np.flatnonzero(size == 2 * d), np.flatnonzero(size == TAG)
+    row = np.concatenate([np.arange(len(means)), lines])
+    ends, P = means[lines, : 2 * d].reshape(-1, 2, d), covariances[lines, d : 2 * d, d : 2 * d].reshape(-1, d, d)
+    return Shapes(
+        row,
+        np.concatenate([means[:, :d].reshape(-1, d), ends[:, 1, :d]]),
+        np.concatenate([covariances[:, :d, :d].reshape(-1, d, d), P]),
+        ends,
+        means[tags, :TAG].reshape(-1, TAG),
+        np.where(np.isin(row, lines), LINES, np.where(np.isin(kinds, EUCLIDEAN), EUCLIDEANS, OTHERS)[row]),
+    )
+
+
+def _ends(place: Array, d: int) -> Array:
+    """Return the points (1, d) of a place, or both ends (2, d) of a line."""
+    return place.reshape(2, d) if len(place) == 2 * d else place[None, :d]
+
+
+def _across(ends: Array) -> Array:
+    """Return the projections (N, d, d) across the line through two ends, of a single point 1."""
+    u = ends[-1] - ends[0]
+    return np.tile(np.eye(len(u)) - np.outer(u, u) / max(float(u @ u), TINY), (len(ends), 1, 1))
+
+
+def _motion(place: Array, d: int, size: int, origin: Array) -> Array:
+    """Return how the error (size,) of a place moves (size, q) with the world about an origin."""
+    ends = _ends(place, d)
+    G = generators(ends, origin)
+    whole = G[0] if d == 3 and len(place) == TAG else G[:, :d].reshape(-1, G.shape[2])
+    return np.vstack([whole, np.zeros((size - len(whole), G.shape[2]))])
+
+
+def _place_jacobian(slam: Slam, name: Id) -> Array:
+    """Return the Jacobian (m, dof) of a landmark's place in its error."""
+    model = slam.landmark_model(name)
+    assert model is not None  # it is in the map
+    dof = model.space.dof
+    if isinstance(model, Segmented):
+        t = slam.segment_ends(name)
+        P_l = model.endpoints(slam.mean(name)[None], np.array([model.first_ends if t is None else t]))[1]
+        return np.asarray(P_l.reshape(-1, dof))
+    found = None if model.kind in EUCLIDEAN else place_of(model, slam.mean(name)[None])
+    return np.eye(dof) if found is None else found[1][0]
+
+
+def _crosses(slam: Slam, names: Sequence[Id], others: Sequence[Id]) -> Iterator[tuple[Id, Array]]:
+    """Yield the cross-covariance (dof, n) of each of some robots and landmarks with others, all of these."""
+    among = set(others)
+    rest = [name for name in names if name not in among]
+    for first in range(0, len(rest), DATUM):
+        some = rest[first : first + DATUM]
+        yield from _parts(slam, some, slam.covariance(*some, *others), len(some))
+    yield from _parts(slam, others, slam.covariance(*others), 0)
+
+
+def _parts(slam: Slam, names: Sequence[Id], P: Array, before: int) -> Iterator[tuple[Id, Array]]:
+    """Yield the rows of each name in a joint covariance, without the columns of the names before the others."""
+    dofs = [slam.robots[str(name)].motion.space.dof if name in slam.robots else _dof(slam, name) for name in names]
+    ends = np.cumsum([0, *dofs]).tolist()
+    for name, first, end in zip(names, ends, ends[1:], strict=False):
+        yield name, P[first:end, ends[-1] if before else 0 :]
+
+
+def _dof(slam: Slam, name: Id) -> int:
+    model = slam.landmark_model(name)
+    assert model is not None
+    return model.space.dof
+
+
+@dataclass(frozen=True)
+class MapLandmarks:
+    """The landmarks of a map: ids, kinds, places with covariances and how often each was observed.
+
+    The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
+    in the map is (`kalmark.results.landmark_table`); NaN if its model does not say where it is.  `exact` are those
+    known exactly beforehand, which the filter had outside its map.  `log_odds` are those that a landmark exists, of the
+    landmarks that were looked at again, and `unseen` those that were not seen again where they should be.
+    """
+
+    ids: list[Id]
+    kinds: list[str]
+    means: list[Array]
+    covariances: list[Array]
+    observations: list[int]
+    in_space: bool = False
+    exact: frozenset[Id] = frozenset()
+    log_odds: Mapping[Id, float] = field(default_factory=dict)
+    unseen: frozenset[Id] = frozenset()
+
+    def __repr__(self) -> str:
+        return f"<MapLandmarks: {len(self)}, known exactly {len(self.exact)}>"
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @classmethod
+    def of(cls, slam: Slam, *, exactly_known: bool = True) -> MapLandmarks:
+        """Return the places of the landmarks of a filter's map, and of those known exactly beside it."""
+        table = slam.landmarks(exactly_known=exactly_known)
+        in_space = any(robot.motion.space.world == "space" for robot in slam.robots.values())
+        d = 3 if in_space else 2
+        means, covariances = [np.full(d, np.nan)] * len(table), [np.full((d, d), np.nan)] * len(table)
+        of_models: dict[int, list[int]] = defaultdict(list)
+        models = [slam.landmark_model(i) for i in table.ids]
+        for k, model in enumerate(models):
+            of_models[id(model)].append(k)
+        for rows in of_models.values():
+            states = np.array([table.means[k] for k in rows]), np.array([table.covariances[k] for k in rows])
+            found = places(models[rows[0]], *states, [slam.segment_ends(table.ids[k]) for k in rows])
+            for k, mean, covariance in zip(rows, *found, strict=True) if found is not None else ():
+                means[k], covariances[k] = mean, covariance
+        observations = [int(count) for count in table.observations]
+        exact = frozenset(name for name in table.ids if slam.is_known(name))
+        of = means, covariances, observations, in_space, exact, table.log_odds, table.unseen
+        return cls(list(table.ids), list(table.kinds), *of)
+
+    def shape(self, slam: Slam, robots: Sequence[str]) -> tuple[MapLandmarks, Array]:
+        """Return the map with the covariances of its shape, and those (R, d, d) of the robots' positions.
+
+        The datum are at most `DATUM` landmarks, evenly chosen by their certainty.
+        """
+        d = 3 if self.in_space else 2
+        points, P = self.positions()
+        exact = np.array([name in self.exact for name in self.ids], dtype=np.bool_)
+        sigma = np.where(np.isfinite(points).all(axis=1) & ~exact, np.trace(P, axis1=1, axis2=2), np.inf)
+        order = np.argsort(sigma, kind="stable")[: np.isfinite(sigma).sum()]
+        own = np.array([slam.covariance(name)[:d, :d] for name in robots]).reshape(-1, d, d)
+        if not len(order):
+            return self, own
+        some = order[np.unique(np.linspace(0, len(order) - 1, min(DATUM, len(order))).round().astype(int))].tolist()
+        ends, names = [_ends(self.means[k], d) for k in some], [self.ids[k] for k in some]
+        J = la.block_diag(*(_place_jacobian(slam, self.ids[k])[: e.size] for k, e in zip(some, ends, strict=True)))
+        datum = Datum.of(
+            np.concatenate(ends), np.concatenate([_across(e) for e in ends]), J @ slam.covariance(*names) @ J.T,
+            points[exact],
+        )  # fmt: skip
+        out = list(self.covariances)
+        with_datum = dict(_crosses(slam, [*robots, *(self.ids[k] for k in order.tolist())], names))
+        for k in order.tolist():
+            G = _motion(self.means[k], d, len(out[k]), datum.origin)
+            out[k] = datum.shape(G, out[k], _place_jacobian(slam, self.ids[k]) @ with_datum[self.ids[k]] @ J.T)
+        for row, name in enumerate(robots):
+            G = generators(slam.mean(name)[None, :d], datum.origin)[0, :d]
+            own[row] = datum.shape(G, own[row], with_datum[name][:d] @ J.T)
+        return replace(self, covariances=out), own
+
+    def split(self) -> tuple[MapLandmarks, MapLandmarks]:
+        """Return the landmarks of the map, and those known exactly beside it."""
+        rows = range(len(self))
+        mapped = self._of([k for k in rows if self.ids[k] not in self.exact])
+        return mapped, self._of([k for k in rows if self.ids[k] in self.exact])
+
+    def _of(self, rows: list[int]) -> MapLandmarks:
+        """Return the landmarks of these rows."""
+        return MapLandmarks(
+            [self.ids[k] for k in rows], [self.kinds[k] for k in rows], [self.means[k] for k in rows],
+            [self.covariances[k] for k in rows], [self.observations[k] for k in rows], self.in_space, self.exact,
+            self.log_odds, self.unseen,
+        )  # fmt: skip
+
+    def positions(self) -> tuple[Array, Array]:
+        """Return the positions (K, d) and their covariances (K, d, d), of lines their first endpoints."""
+        d = 3 if self.in_space else 2
+        means = np.array([mean[:d] for mean in self.means]).reshape(-1, d)
+        return means, np.array([cov[:d, :d] for cov in self.covariances]).reshape(-1, d, d)
+
+    def places(self) -> tuple[Array, Array]:
+        """Return the places (K, n) and covariances (K, q, q), padded with NaN; of points of the plane the positions."""
+        if self.in_space:
+            return padded_all(self.means), padded_all(self.covariances, 2)
+        if not any(len(mean) == WALL for mean in self.means):
+            return self.positions()
+        sizes = [WALL if len(mean) == WALL else 2 for mean in self.means]
+        means = [mean[:n] for mean, n in zip(self.means, sizes, strict=True)]
+        return padded_all(means), padded_all([P[:n, :n] for P, n in zip(self.covariances, sizes, strict=True)], 2)
+
+    def to_csv(self) -> str:
+        """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations.
+
+        If there are any known exactly, `known` is "exactly" in their rows; if any were looked at again, there are the
+        `log_odds` that they exist, and `mark` is "not seen again" of those that were not where they should be.
+        """
+        axes = [
+            _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
+            for kind, mean in zip(self.kinds, self.means, strict=True)
+        ]
+        columns = list(dict.fromkeys(name for names in axes for name in names))
+        columns = columns or list(_POINT if self.in_space else _POINT[:2])
+        errors = {_errors(names) for names in axes} or {_errors(columns)}
+        used = {pair for names in errors for pair in combinations_with_replacement(names, 2)}
+        pairs = [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        more = ["known"] * bool(self.exact) + ["log_odds", "mark"] * bool(self.log_odds)
+        writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations", *more])
+        for i, names in enumerate(axes):
+            at, row = ({name: j for j, name in enumerate(of)} for of in (names, _errors(names)))
+            mean = [repr(float(self.means[i][at[name]])) if name in at else "" for name in columns]
+            cov = [repr(float(self.covariances[i][row[a], row[b]])) if {a, b} <= row.keys() else "" for a, b in pairs]
+            name = self.ids[i]
+            more = ["exactly" if name in self.exact else ""] if self.exact else []
+            if self.log_odds:
+                odds = repr(float(self.log_odds[name])) if name in self.log_odds else ""
+                more += [odds, UNSEEN if name in self.unseen else ""]
+            writer.writerow([name, self.kinds[i], *mean, *cov, self.observations[i], *more])
+        return out.getvalue()
+
+    @classmethod
+    def read(cls, path: Path) -> MapLandmarks:
+        """Read a ``landmarks.csv``.  Raises RunError naming file and line."""
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.DictReader(file)
+            table, exact = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ())), set[Id]()
+            plane, odds, unseen = False, dict[Id, float](), set[Id]()
+            for number, row in enumerate(rows, start=2):
+                try:
+                    names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
+                    errors = _errors(names)
+                    cov = np.empty((len(errors), len(errors)))
+                    for (i, a), (j, b) in combinations_with_replacement(enumerate(errors), 2):
+                        cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
+                    table.ids.append(as_id(row["id"]))
+                    table.kinds.append(row["kind"])
+                    plane |= row["kind"] == PointHeight2D.kind or not row.get("z_m")
+                    table.means.append(np.array([float(row[name]) for name in names]))
+                    table.covariances.append(cov)
+                    table.observations.append(int(row["observations"]))
+                    exact |= {table.ids[-1]} if row.get("known") else set()
+                    odds |= {table.ids[-1]: float(row["log_odds"])} if row.get("log_odds") else {}
+                    unseen |= {table.ids[-1]} if row.get("mark") else set()
+                except (KeyError, TypeError, ValueError) as error:
+                    raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
+        in_space = table.in_space and not plane
+        return replace(table, in_space=in_space, exact=frozenset(exact), log_odds=odds, unseen=frozenset(unseen))
+
+
+def refuse_other_than_points(slam: Slam, what: str, *, walls: bool = False) -> None:
+    """Refuse a map with walls, unless `walls` may be, or a user's own landmarks that are more than points with numbers.
+
+    Raises KalmarkError.
+    """
+    for track in slam.tracks.confirmed.values():
+        if walls and isinstance(track.model, Wall2D):
+            continue
+        first, *others = track.model.space.kinds
+        odd = not is_own(type(track.model)) and (first not in (VECTOR, VECTOR3) or {*others} - {SCALAR})
+        if odd or isinstance(track.model, Wall2D):
+            raise KalmarkError(f"{what}: landmark {track.id!r} is a {track.model.kind}, expected points")
+
+
+def _errors(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the components of the error of what has these columns: a quaternion's is a rotation."""
+    turn = ("rx_rad", "ry_rad", "rz_rad") if "qw" in names else ()
+    return (*(name for name in names if not name.startswith("q")), *turn)
+
+
+def _cov_name(a: str, b: str) -> str:
+    return "cov_" + "".join(name[0] if name == "signature" else name.partition("_")[0] for name in (a, b))

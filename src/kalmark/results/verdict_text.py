@@ -1,0 +1,70 @@
+"""A verdict in plain words: one source for the terminal, the page and the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from kalmark.results.checked import OK, UNCHECKED, worst
+from kalmark.results.figure_texts import count, figure
+
+SHOWN = 3  # causes in a short verdict
+ROUNDING_M = 1e-9
+INNOVATIONS = "innovations alone"  # how a map was checked that has no batch solution
+NO_MAP = "no landmark is in the map"  # why there is none: only the path is to be judged
+NO_BATCH = "none was found for this log"  # why there is none of a map
+NO_LANDMARKS = "no sensor observes landmarks"  # why there is no map, either
+SEEN = 0.02  # by which a factor of the sigmas is worth a word, and of the accuracy a shift
+
+
+def verdict_lines(verdict: Mapping[str, Any], shown: int | None = SHOWN) -> Iterator[str]:
+    """Yield a verdict of ``summary.json`` in words: the map, then so many causes (None: all), each with its cure."""
+    causes = verdict["causes"]
+    yield _first(verdict)
+    some = causes if shown is None else causes[:shown]
+    for cause in some:
+        yield f"{cause['name']}: {cause['evidence']}{'; ' + cause['cure'] if cause['cure'] else ''}"
+    if len(some) < len(causes):
+        yield f"{count(len(causes) - len(some), 'more cause')}: kalmark diagnose"
+
+
+def alarm(verdict: Mapping[str, Any] | None) -> list[str]:
+    """Return the lines for the picture of a map or a path that is not ok: the first cause."""
+    if verdict is None or overall(verdict) == OK:
+        return []
+    return [_first(verdict), *(cause["evidence"] for cause in verdict["causes"][:1])]
+
+
+def overall(verdict: Mapping[str, Any]) -> str:
+    """Return the worst status of a map and of the paths of its robots."""
+    return worst(verdict["map"], *verdict.get("robots", {}).values())
+
+
+def _first(verdict: Mapping[str, Any]) -> str:
+    """Return the line that says it all: what the map, or the path, is, by which cause, and to what accuracy."""
+    harmful = [cause["name"] for cause in verdict["causes"] if not cause["harmless"]]
+    why = f" because of {harmful[0]}" if harmful and verdict["map"] not in (OK, UNCHECKED) else ""
+    why = ": the log does not check it" if verdict["map"] == UNCHECKED else why
+    what = "path" if str(verdict["checked"]).endswith((NO_MAP, NO_LANDMARKS)) else "map"
+    paths = [f"the path of {of} is {status}" for of, status in _worse(verdict)]
+    return "; but ".join([f"the {what} is {verdict['map']}{why}{_trust(verdict)}", *[", ".join(paths)] * bool(paths)])
+
+
+def _worse(verdict: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the robots whose path is worse than the map, and what it is."""
+    robots = verdict.get("robots", {})
+    return ((of, status) for of, status in robots.items() if status != verdict["map"])
+
+
+def _trust(verdict: Mapping[str, Any]) -> str:
+    """Return to what accuracy a map can be trusted."""
+    factor, accuracy, shift = (verdict[key] for key in ("sigma_factor", "accuracy_m", "shift_m"))
+    if verdict["map"] != "ok":
+        least = max(SEEN * (accuracy or 0.0), ROUNDING_M)
+        return f": its shape is off by {figure(shift)} m" if shift and shift > least else ""
+    if factor is None:
+        return f", by {checked}" if (checked := str(verdict["checked"])).startswith(INNOVATIONS) else ""
+    said = f"{figure(factor, 2)} times what the filter states" if abs(factor - 1.0) > SEEN else "as the filter states"
+    world, shape = (figure(value, 2) for value in (accuracy, verdict.get("shape_accuracy_m", accuracy)))
+    good = f"{shape} m in shape, {world} m in the world" if shape != world else f"{world} m in shape and in the world"
+    return f": its landmarks are good to {good} (1 sigma, {said})"

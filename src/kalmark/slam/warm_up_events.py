@@ -1,0 +1,225 @@
+"""Made-up events for the robots of a Slam: what `Slam.warm_up` lets its twin take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.association import ByIdentity
+from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.filter.compressed.compressed_map import CompressedMap
+from kalmark.filter.compressed.restoring import NUMBERS
+from kalmark.filter.compressed.storage import Triangle
+from kalmark.filter.map import StochasticMap
+from kalmark.geometry import frames, frames3d
+from kalmark.geometry.spaces import VECTOR, VECTOR3
+from kalmark.models.landmark_views import Spatial
+from kalmark.models.model_check import views
+from kalmark.models.protocols import (
+    TWIST,
+    Landmark,
+    OfState,
+    Reparametrizable,
+    SeesVelocity,
+    SegmentVisible,
+    image_size,
+    range_limit,
+)
+from kalmark.models.sensors import Wall
+from kalmark.slam.estimate import Estimate
+from kalmark.slam.merging import make_equal
+from kalmark.slam.robot import IDENTITY, Mount, Robot
+from kalmark.tracks.track import ChannelKey
+
+ROUNDS = 12  # of a control and scans: enough for whatever waits for several
+SEEN = 3  # observations in a scan
+STEP_S = 0.5
+INTERVAL = 5  # events in a compression interval
+REPEATS = 4  # scans of one landmark, while all others are inactive
+POINTS = ((VECTOR,), (VECTOR3,))
+MOVING = 0.5  # each number of a control
+LOST_PIXELS = 0.2  # of an image, at its border
+
+
+def without_detectors(robots: Iterable[Robot]) -> list[Robot]:
+    """Return the robots with sensors that take measurements, not raw scans."""
+    return [
+        replace(robot, sensors={name: replace(mount, detector=None) for name, mount in robot.sensors.items()})
+        for robot in robots
+    ]
+
+
+@runtime_checkable
+class Compiling(Protocol):
+    """A detector that compiles what it needs before its first scan."""
+
+    def warm_up(self) -> None:
+        """Compile it."""
+
+
+def warm_up_detectors(robots: Iterable[Robot]) -> None:
+    """Let the detectors of robots compile what they need."""
+    for robot in robots:
+        for mount in robot.sensors.values():
+            if isinstance(mount.detector, Compiling):
+                mount.detector.warm_up()
+
+
+def rehearse(
+    twin: Estimate, process: Callable[[Event], object], add: Callable[..., None]
+) -> list[tuple[Id, Array, Landmark]]:
+    """Let a twin of a Slam take made-up events by `process`, and use all that they lead to; `add` adds landmarks.
+
+    Return the landmarks that it has then: name, mean and model.
+    """
+
+    def pose(robot: str, sensor: str) -> Array:
+        channel, slot = twin.state.channels.get((robot, sensor)), twin.state.moving[robot].slot
+        return twin.map.mean(slot) if channel is None else channel.pose(twin.map, slot)
+
+    for k, event in enumerate(rehearsal(twin.robots.values(), pose)):
+        with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
+            process(event)
+        if k % INTERVAL == INTERVAL - 1 and isinstance(twin.map, CompressedMap):
+            twin.map.full_update()  # what comes next activates some blocks again, not all
+    _add_landmarks(twin, process, pose, add)
+    with suppress(Exception):
+        _observe_all(twin, process)
+    _merge(twin)
+    tracks = [*twin.tracks.confirmed.values()]
+    twin.covariance(*twin.robots, *twin.tracks.confirmed)
+    found = [(track.id, twin.mean(track.id), track.model) for track in tracks]
+    for track in tracks:
+        if isinstance(track.model, Reparametrizable):
+            track.model.to_point(twin.mean(track.id)[None])
+    for track in tracks:
+        twin.map.remove(track.slot)
+    if isinstance(twin.map, CompressedMap):
+        twin.map.finish()
+    elif isinstance(twin.map, StochasticMap):  # it may grow
+        CompressedMap.from_dense(twin.map, Triangle(NUMBERS[twin.state.settings.numbers]))
+    return found
+
+
+def _add_landmarks(
+    twin: Estimate, process: Callable[[Event], object], pose: Callable[[str, str], Array], add: Callable[..., None]
+) -> None:  # fmt: skip
+    """Let each sensor begin landmarks where it is now, and add points where it sees such: others become points, too."""
+    for key, channel in [*twin.state.channels.items()]:
+        scene = _Scene(twin.robots[key[0]].sensors[key[1]], pose(*key))
+        with suppress(Exception):
+            y = scene.measured(pose(*key))
+            process(_scan(twin, key, y, [f"{key} {k}" for k in range(len(y))]))
+        for kind, model in channel.models.items():
+            if model.landmark.space.kinds in POINTS and scene.points is not None:
+                for k, place in enumerate(scene.points):
+                    with suppress(Exception):
+                        add(f"{key} {kind} {k}", place, 0.01 * np.eye(len(place)), model.landmark)
+
+
+def _observe_all(twin: Estimate, process: Callable[[Event], object]) -> None:
+    """Let each sensor observe what it can, of what others have begun, too, as it is expected.
+
+    First one landmark in view again and again, while the others are inactive, then all of them together, then twice in
+    a scan without ids, so that an association has to decide; then each alone, in view or not.
+    """
+    for key in [*twin.state.channels]:
+        asked = twin.expect(*key)
+        finite = np.isfinite(asked.e).all(axis=1)
+        seen = np.flatnonzero(finite & asked.in_view)
+        scans = [seen[:1]] * REPEATS + [seen, np.repeat(seen, 2), *np.flatnonzero(finite)[:, None]]
+        for k, rows in enumerate(scans):
+            ids = None if k == REPEATS + 1 else [asked.names[i] for i in rows]
+            with suppress(Exception):
+                process(_scan(twin, key, asked.e[rows], ids))
+            if k % 2 and isinstance(twin.map, CompressedMap):
+                twin.map.full_update()
+
+
+def _scan(twin: Estimate, key: ChannelKey, y: Array, ids: list[Id] | None) -> Scan:
+    """Return a scan of a robot's sensor that comes next."""
+    return Scan(t_ns=(twin.t_ns or 0) + 1, robot=key[0], sensor=key[1], y=y, ids=ids)
+
+
+def _merge(twin: Estimate) -> None:
+    """Make two landmarks equal, as where observations have no ids: through a model in Python."""
+    for (robot, sensor), policy in twin.state.policies.items():
+        channel = twin.state.channels[robot, sensor]
+        mine = [track.id for track in twin.tracks.confirmed.values() if track.model.kind == channel.landmark.kind]
+        if not isinstance(policy.association, ByIdentity) and policy.upkeep.merge and len(mine) > 1:
+            with suppress(Exception):
+                make_equal(twin.state, channel, twin.state.moving[robot].slot, [(mine[0], mine[1])])
+
+
+def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
+    """Yield events of each robot and sensor: a few landmarks seen again and again, with ids and without, and a fix.
+
+    `pose` gives where a robot's sensor, both by name, is when it is asked, (3,) or (7,).
+    """
+    robots, t_s = list(robots), 0.0
+    mounts = {(robot.name, name): mount for robot in robots for name, mount in robot.sensors.items()}
+    readings = {key: _reading(m.sensor, len(m.at)) for key, m in mounts.items() if isinstance(m.sensor, OfState)}
+    scenes = {key: _Scene(mount, pose(*key)) for key, mount in mounts.items() if key not in readings}
+    for k in range(ROUNDS):
+        for robot in robots:
+            t_s += STEP_S
+            yield Control(t_s, robot.name, np.full(len(robot.motion.columns), MOVING))
+            for name in robot.sensors:
+                if (robot.name, name) in readings:
+                    t_s += STEP_S
+                    yield Scan(t_s, robot.name, name, readings[robot.name, name])
+                    continue
+                y = scenes[robot.name, name].measured(pose(robot.name, name))
+                for ids in ([f"{name} {i}" for i in range(len(y))], None):
+                    t_s += STEP_S
+                    yield Scan(t_s, robot.name, name, y, ids)
+            if k == ROUNDS - 2:
+                size = 2 if robot.motion.space.axes == 1 else 3
+                yield Fix(t_s, robot.name, np.asarray(robot.start)[:size], np.eye(size))
+
+
+def _reading(sensor: Any, pose: int) -> Array:
+    """Return what a sensor of the state reads of a robot that stands at the origin; a pose has 3 or 7 numbers."""
+    still = np.zeros((1, 3 if pose == 3 else 6))
+    return np.asarray(sensor.expect(still if sensor.views == TWIST else np.array([IDENTITY[pose]]))[0])
+
+
+class _Scene:
+    """What a mounted sensor, at T in the beginning, sees: points that stay where they are, or always the same."""
+
+    def __init__(self, mount: Mount, T: Array) -> None:
+        self.sensor, rng = mount.sensor, np.random.default_rng(0)
+        self.fixed: Array | None = None
+        self.places: Array | None = None  # where the points are that stay, (SEEN, 2 or 3),
+        self.points: Array | None = None  # and others that it sees
+        if isinstance(self.sensor, SegmentVisible) and (size := image_size(self.sensor)) is not None:
+            inside = rng.uniform(LOST_PIXELS, 1.0 - LOST_PIXELS, (SEEN, len(self.sensor.columns)))
+            self.fixed = inside * [*size, *size]
+            return
+        if isinstance(self.sensor, Wall):
+            distance = min(range_limit(self.sensor), 10.0) / 4.0
+            self.fixed = np.array([[distance, 0.4 * k, -distance, distance] for k in range(SEEN)])
+            return
+        self.v = views(self.sensor, rng)[0][:SEEN].copy()
+        d, numbers = 2 if len(T) == 3 else 3, self.v.shape[1]
+        if d == 2 or numbers in (3, 4) or isinstance(self.sensor, SeesVelocity):
+            here, rays = frames.from_frame_many if d == 2 else frames3d.from_frame_many, numbers == d + 1 == 4
+            v = self.v[:, :d] / self.v[:, 3:] if rays else self.v[:, :d]
+            self.points = here(T, np.ascontiguousarray(v))[0]
+            self.places = None if rays else self.points
+
+    def measured(self, T: Array) -> Array:
+        """Return the measurements (SEEN, m) from T."""
+        if self.fixed is not None:
+            return self.fixed
+        if self.places is not None:
+            seen_from = frames.to_frame_many if len(T) == 3 else frames3d.to_frame_many
+            self.v[:, : self.places.shape[1]] = seen_from(T, self.places)[0]
+        y = np.tile([0.3 * (name == "size_m") for name in self.sensor.columns], (len(self.v), 1))
+        e = self.sensor.expect(self.v, y)[0] if isinstance(self.sensor, Spatial) else self.sensor.expect(self.v)[0]
+        return np.ascontiguousarray(e, dtype=np.float64)
