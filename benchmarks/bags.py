@@ -27,10 +27,11 @@ import numpy as np
 from kalmark.config import build_slam, open_run
 from kalmark.events import Scan
 from kalmark.geometry.frames3d import compose, inverse
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs import Log, find_data, open_log
 from kalmark.logs.bag.first_config import first_config
 from kalmark.logs.bag.survey import survey
-from kalmark.logs.source import placed, seconds
+from kalmark.logs.source import seconds
 from kalmark.logs.tagslam import SIGMA, Scene, frame_of, read_cameras, read_scene
 from kalmark.results.mcap import export
 from kalmark.results.record import record
@@ -100,7 +101,7 @@ def edited(lines: list[str], where: Path, own: Log) -> list[str]:
     mount = poses[next(iter(cameras))]
     for body in scene.odometry.values():  # the robot's frame is that of its odometry
         mount = compose(inverse(frame_of(body["T_body_odom"]))[0], mount)[0]
-    section = camera | {"mount": placed(mount), "sigma_px": NOISE_PX}
+    section = camera | {"mount": describe_pose(mount), "sigma_px": NOISE_PX}
     scans = [event for event in own.events if isinstance(event, Scan)]
     sizes = {tag: float(y[8]) for scan in scans for tag, y in zip(scan.ids or (), scan.y, strict=True)}
     usual = max(set(sizes.values()), key=list(sizes.values()).count)

@@ -17,10 +17,10 @@ from kalmark.config import build_slam, config_dict, load_config
 from kalmark.config.opening import open_run
 from kalmark.errors import ConfigError, KalmarkError, ModelError
 from kalmark.logs import FORMATS, formats
-from kalmark.results.filter_description import describe
 from kalmark.results.recording import config_yaml
 from kalmark.simulate.robots import simulate
 from kalmark.simulate.worlds import load_world
+from kalmark.slam.description import describe
 
 PLUGIN = '''
 from typing import Annotated, ClassVar

@@ -299,11 +299,6 @@ def own_name(model: type) -> str:
     return f"{model.__module__ if file is None else file.name}:{model.__qualname__}"
 
 
-def by_class_name(role: str, name: str) -> type | None:
-    """Return the registered class of that name of its own."""
-    return next((each for models in _CLASSES.get(role, {}).values() for each in models if each.__name__ == name), None)
-
-
 # ------------------------------------------------------------------ a user's own files
 def load_plugin(file: Path) -> ModuleType:
     """Run a Python file of the user's, unless it is imported already, and return it.
@@ -342,14 +337,21 @@ def plugin_of(model: Any) -> Path | None:
     return None if is_own(model) else _file_of(sys.modules.get(model.__module__))
 
 
-def register_by_file(role: str, name: str) -> bool:
-    """Register file.py:Class under this name if a plugin has it, and return whether one has."""
+def class_of_file(name: str) -> type | None:
+    """Return the class that a plugin has of the name file.py:Class, None if none has it."""
     place, _, attribute = name.rpartition(":")
     for file, module in _PLUGINS.items():
         if place in (file.stem, file.name, str(file)) and isinstance(model := vars(module).get(attribute), type):
-            register(role, name)(model)
-            return True
-    return False
+            return model
+    return None
+
+
+def register_by_file(role: str, name: str) -> bool:
+    """Register file.py:Class under this name if a plugin has it, and return whether one has."""
+    model = class_of_file(name)
+    if model is not None:
+        register(role, name)(model)
+    return model is not None
 
 
 def line_of(error: BaseException) -> str:

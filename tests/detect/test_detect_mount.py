@@ -15,8 +15,8 @@ from kalmark.cli.run import run_log
 from kalmark.config.building import build_robot
 from kalmark.config.reading import load_config
 from kalmark.geometry.rotations import matrix
-from kalmark.results.filter_description import describe
 from kalmark.results.recording import config_yaml
+from kalmark.slam.description import describe
 from laser_worlds import ANGLES, SIGMA_M, LaserWorld
 
 Data = Callable[[str], Path]

@@ -15,9 +15,9 @@ from kalmark.config.building import build_slam
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.geometry import rotation, wrap
 from kalmark.logs import open_log, write_native
-from kalmark.results.filter_description import describe
 from kalmark.simulate import load_world, simulate
 from kalmark.simulate.robots import simulation
+from kalmark.slam.description import describe
 from kalmark.slam.held_control import Mean
 
 CALIBRATED = ("differential_drive", "tricycle", "omnidirectional", "mecanum")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,16 @@ from pydantic import BaseModel
 
 from kalmark.arrays import Array
 from kalmark.config.opening import described, known_path, open_run
-from kalmark.config.reading import did_you_mean, load_config
-from kalmark.config.schema import TRUTH, Config, SpaceStartConfig, covariance_of, pose_of, state_of
-from kalmark.config.sections import model_of
-from kalmark.config.tree import EACH
+from kalmark.config.reading import did_you_mean, load_config, validate
+from kalmark.config.schema import TRUTH, Config, SpaceStartConfig
+from kalmark.config.sections import ModelSection, model_of
+from kalmark.config.tree import EACH, Tree, show
 from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Frame, Scan
+from kalmark.geometry.named_poses import pose_of, world_of
 from kalmark.logs import tagslam
 from kalmark.logs.images.image_files import size_of
 from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
@@ -30,28 +32,29 @@ from kalmark.models.landmark_views import Raised
 from kalmark.models.landmarks import PointHeight2D
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import state_columns
+from kalmark.slam.description import EXACT, OF_PLACE, covariance_of, describe_place, state_of
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
+from kalmark.slam.state import Settings
 
 BY_SIGMAS = "state a start without at_rest, as uncertain as it is: sigma_rotation_deg, sigma_v_mps, sigma_bias_..."
 
 
-def build_slam(config: Config, log: Log | None = None) -> Slam:
+def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
     """Return the filter that a configuration describes, for the robots of a log and with what the log says of them.
 
-    Without a log the robots are those that the configuration names; `each` alone is one robot called "robot".
+    Without a log the robots are those that the configuration names; `each` alone is one robot called "robot".  What is
+    `given`, arguments of `Slam`, stands in the place of what is configured.
     """
     config = config if log is None else described(config, log)
-    robots = [build_robot(config, name, log) for name in _names(config, log)]
-    m, kept = config.map, model_of(config.upkeep)
-    types = {
-        "association": _made(config, ("association",), model_of, config.association),
-        "estimator": _made(config, ("estimator",), model_of, config.estimator),
-        "landmarks": _made(config, ("landmarks",), model_of, config.landmarks, robots[0].motion.space.world),
-    }
-    kept_map = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
-    kept_map["longest_pause_s"] = config.longest_pause_s
-    slam: Slam = _made(config, ("robots",), Slam, robots, **types, **kept_map, upkeep=kept)
+    robots = given.pop("robots", None) or [build_robot(config, name, log) for name in _names(config, log)]
+    m = config.map
+    kept = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
+    for each in fields(Settings):
+        if each.name not in (*kept, *given):
+            made = _part(config, (each.name,), getattr(config, each.name), robots[0].motion.space.world)
+            kept[each.name] = made
+    slam: Slam = _made(config, ("robots",), Slam, robots, **kept, **given)
     for name, mean, cov, columns in _known(config, log):
         high = columns == HIGH and robots[0].motion.space.world == "plane"
         try:
@@ -85,6 +88,12 @@ def slam_from_config(path_or_name: str | Path) -> Slam:
     return build_slam(config) if config.log.path is None else build_slam(*open_run(path_or_name))
 
 
+def slam_described(said: dict[str, Any], **given: Any) -> Slam:
+    """Return the filter that `kalmark.slam.description.describe` describes, with models `given` for some of it."""
+    kept = {key: value for key, value in said.items() if key not in given}
+    return build_slam(validate(Tree(kept, places={(): "settings"}), Config), **given)
+
+
 def config_dict(config: Config) -> dict[str, Any]:
     """Return everything in force as plain values, to be saved as ``config.yaml`` and loaded again."""
     content = _plain(config)
@@ -115,7 +124,7 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     moves = _made(config, (*path, "motion"), model_of, robot.motion)
     if log is not None:
         refuse_controls(config, key, name, moves.columns, log)
-    start, cov = _start(robot.start, name, log, moves)
+    start, cov = _start(config, (*path, "start"), robot.start, name, log, moves)
     rests: dict[str, Any] = {}
     if isinstance(robot.start, SpaceStartConfig) and robot.start.at_rest:
         start, cov, rests["rests_until_ns"] = _made(config, (*path, "start"), _at_rest, moves, name, log, start, cov)
@@ -124,8 +133,8 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     if log is not None:
         refuse_scans(config, key, name, mounts, log)
         refuse_uncalibrated(config, key, name, log)
-    watched = {key: getattr(robot, key) for key in ("gaps", "max_speed_mps", "max_turn_radps")}
-    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov, **watched, **rests)
+    own = {each.name: getattr(robot, each.name) for each in fields(Robot) if each.name not in OF_PLACE} | rests
+    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov, **own)
 
 
 def _names(config: Config, log: Log | None) -> list[str]:
@@ -139,13 +148,31 @@ def _names(config: Config, log: Log | None) -> list[str]:
     return list(log.robots)
 
 
-def _start(section: Any, name: str, log: Log | None, moves: MotionModel) -> tuple[Any, Any]:
+def _start(
+    config: Config, path: tuple[str, ...], section: Any, name: str, log: Log | None, moves: MotionModel
+) -> tuple[Any, Any]:
     """Return the start and its covariance: as configured, else by the truth, else the origin."""
-    space = moves.space
     if section is not None:
-        behind = state_columns(moves)
-        return [*pose_of(section), *state_of(section, behind)], covariance_of(section, space.dof, behind)
+        return _placed(config, path, section, moves.space.dof, state_columns(moves))
     return (None, None) if log is None else true_start(log, name, moves)
+
+
+def _placed(
+    config: Config, path: tuple[str, ...], section: Any, dof: int, behind: tuple[str, ...] = ()
+) -> tuple[list[float], Array | None]:
+    """Return where a section places a mount or a start, with its state, and the covariance.
+
+    Raises ConfigError where one of its exact keys says otherwise than the readable ones beside it.
+    """
+    said = vars(section)
+    at, cov = [*pose_of(said), *state_of(said, behind)], covariance_of(said, dof, behind)
+    exact = [key for key in EXACT if said.get(key) is not None]
+    told = describe_place(at, world_of(said), cov, behind) if exact else {}
+    for key in (section.model_fields_set & told.keys()) - {*EXACT}:
+        if not np.allclose(said[key], told[key], rtol=1e-6, atol=1e-9):
+            what = f"expected {show(told[key])} as its {' and '.join(exact)} says, or none of these beside it"
+            raise config.error((*path, key), f"got {show(said[key])}, {what}")
+    return at, cov
 
 
 def _at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any) -> tuple[Array, Array, int]:
@@ -167,25 +194,21 @@ def _at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any)
 
 
 def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mount:
-    own = {
-        "landmark": _made(config, (*path, "landmark"), model_of, sensor.landmark, world),
-        "association": _made(config, (*path, "association"), model_of, sensor.association),
-        "cov": covariance_of(sensor.mount, 3 if world == "plane" else 6),
-        "robust": sensor.robust,
-    }
-    if sensor.detector is not None:
-        found, chooses = sensor.detector, "signature" in type(sensor.detector).model_fields
-        if chooses and found.signature is None:
-            found = found.model_copy(update={"signature": "signature" in sensor.type})
-        own["detector"] = _made(config, (*path, "detector"), model_of, found)
-    own |= {key: model_of(part) for key in ("attention", "upkeep") if (part := getattr(sensor, key)) is not None}
-    if world == "plane" and sensor.initialization.type != "immediate":
-        own["initialization"] = _made(config, (*path, "initialization"), model_of, sensor.initialization)
-    model = _made(config, path, model_of, sensor)
+    own = {each.name: getattr(sensor, each.name) for each in fields(Mount) if each.name not in OF_PLACE}
+    if sensor.initialization.type == "immediate":
+        del own["initialization"]
+    parts = {name: _part(config, (*path, name), part, world) for name, part in own.items() if part is not None}
+    model = _made(config, path, model_of, sensor, world)
     if world == "plane" and sensor.mount.z_m and not isinstance(model, Raised):
         what = f"got {sensor.mount.z_m:g}, expected none: a {sensor.type} measures in the plane"
         raise config.error((*path, "mount", "z_m"), what)
-    return _made(config, path, Mount, model, at=pose_of(sensor.mount), **own)
+    at, cov = _placed(config, (*path, "mount"), sensor.mount, 3 if world == "plane" else 6)
+    return _made(config, path, Mount, model, at=at, cov=cov, **parts)
+
+
+def _part(config: Config, path: tuple[str, ...], value: Any, world: str) -> Any:
+    """Return the model that a section describes, or a value that is none."""
+    return _made(config, path, model_of, value, world) if isinstance(value, ModelSection) else value
 
 
 def _made(config: Config, path: tuple[str, ...], make: Callable[..., Any], *args: Any, **keys: Any) -> Any:

@@ -80,7 +80,7 @@ def page() -> str:
     ]
     parts += [_choice(f"{of_sensor}.detector`", "detector")]
     parts += [_section(f"{of_sensor}.mount`, in the plane", schema.MountConfig)]
-    parts += [_choice(f"{of_sensor}.initialization`, in the plane", "initialization")]
+    parts += [_choice(f"{of_sensor}.initialization`", "initialization")]
     parts += [_section(f"{of_sensor}.mount`, in space", schema.SpaceMountConfig)]
     parts += [_section(f"{of_sensor}.attention`", section_of("attention", "attention"))]
     parts += [_choice("`landmarks`, and `landmark` of a sensor", "landmark")]

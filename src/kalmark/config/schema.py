@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
 
-from kalmark.arrays import Array
 from kalmark.config.sections import (
     BASES,
     Choice,
@@ -29,8 +27,9 @@ from kalmark.config.tree import OVERRIDE, name_of
 from kalmark.declare import classes, register, registered_name
 from kalmark.errors import ConfigError
 from kalmark.events import LONGEST_PAUSE_S
-from kalmark.geometry.rotations import from_euler
+from kalmark.geometry.named_poses import world_of
 from kalmark.models.protocols import state_columns
+from kalmark.slam.description import STATES, known, sigma_of
 
 Motion = Annotated[Any, Choice("motion")]
 Estimator = Annotated[Any, Choice("estimator", default="invariant")]
@@ -43,21 +42,12 @@ Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
 Topic = Annotated[Any, Choice("topic")]
 
 Plugins = Annotated[tuple[str, ...], Field(strict=False)]
+Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
 
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
 _PLANE_FOR_SPACE = "a key of the plane for a robot of space"
-STATES = {
-    "plane": ("vx_mps", "vy_mps", "w_radps", "slip"),
-    "space": (
-        "vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps",
-        "bias_wx_radps", "bias_wy_radps", "bias_wz_radps", "bias_ax_mps2", "bias_ay_mps2", "bias_az_mps2",
-        "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
-    ),
-}  # fmt: skip
-"""What a state may have behind its pose, as keys of a start."""
-_AXIS = re.compile(r"(?:_|(?<=[vwa]))[xyz](?=_)")  # of a key: vx_mps, gravity_x_mps2
 POSE_OF_PLANE = ("theta_rad", "sigma_xy_m", "sigma_theta_rad")
-POSE_OF_SPACE = ("z_m", "roll_deg", "pitch_deg", "yaw_deg", "sigma_position_m", "sigma_rotation_deg")
+POSE_OF_SPACE = ("z_m", "roll_deg", "pitch_deg", "yaw_deg", "sigma_position_m", "sigma_rotation_deg", "quaternion")
 
 
 class _Place(Section):
@@ -65,6 +55,8 @@ class _Place(Section):
     """Position along x: forward."""
     y_m: Number = 0.0
     """Position along y: to the left."""
+    cov: Annotated[tuple[Numbers, ...], Field(strict=False)] | None = None
+    """The covariance, row by row, where it is more than sigmas: position, rotation, what a state has behind them."""
 
 
 class PlanePose(_Place):
@@ -95,6 +87,8 @@ class SpacePose(_Place):
     """Standard deviation of each coordinate; or a list of three."""
     sigma_rotation_deg: Sigmas = 0.0
     """Standard deviation of the rotation about each axis; or a list of three."""
+    quaternion: Numbers | None = None
+    """The rotation to the last digit: [qx, qy, qz, qw]."""
 
 
 class MountConfig(PlanePose):
@@ -133,6 +127,8 @@ class StartConfig(PlanePose):
     """constant_velocity, constant_turn_rate: standard deviation of the turn rate."""
     sigma_slip: NotNegative = 0.0
     """slipping_unicycle: standard deviation of the slip."""
+    state: Numbers | None = None
+    """What the state has behind its pose, of a motion of your own with other names than these."""
 
 
 class SpaceStartConfig(SpacePose):
@@ -180,6 +176,8 @@ class SpaceStartConfig(SpacePose):
     """inertial: standard deviation of each bias of the specific force; or a list of three."""
     sigma_gravity_mps2: Sigmas = 0.0
     """inertial_gravity: standard deviation of each coordinate of the gravity; or a list of three."""
+    state: Numbers | None = None
+    """What the state has behind its pose, of a motion of your own with other names than these."""
 
 
 @register("initialization", "immediate")
@@ -208,6 +206,8 @@ class Mounted(ModelSection):
     """What makes a landmark; the configuration's `upkeep` if absent."""
     detector: Detector | None = None
     """How landmarks are found in raw scans: one that finds what the sensor measures."""
+    initialization: Initialization = section_of("initialization", "immediate")()
+    """Start landmarks at first sight, or late; late ones are points."""
     robust: Literal["huber", "student"] | None = None
     """How outliers count less: bounded, or hardly at all.  All observations count in full if absent."""
     preset: Preset | None = None
@@ -231,8 +231,6 @@ class Mounted(ModelSection):
 class PlaneMounted(Mounted):
     """What every sensor of the plane has."""
 
-    initialization: Initialization = section_of("initialization", "immediate")()
-    """Start landmarks at first sight, or late; late ones are points."""
     mount: MountConfig = MountConfig()
     """Where the sensor sits on the robot."""
 
@@ -256,50 +254,9 @@ PlaneSensor = Annotated[Any, Choice("sensor", "plane")]
 SpaceSensor = Annotated[Any, Choice("sensor", "space")]
 
 
-def pose_of(section: PlanePose | SpacePose) -> Array:
-    """Return the pose that a mount or a start describes: (3,) in the plane, (7,) in space."""
-    if isinstance(section, PlanePose):
-        return np.array([section.x_m, section.y_m, section.theta_rad])
-    q, _ = from_euler(np.radians([section.roll_deg, section.pitch_deg, section.yaw_deg]))
-    return np.array([section.x_m, section.y_m, section.z_m, *q])
-
-
-def covariance_of(section: PlanePose | SpacePose, dof: int, behind: tuple[str, ...] = ()) -> Array | None:
-    """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly.
-
-    `behind` are the names of what the state has behind its pose.
-    """
-    if isinstance(section, PlanePose):
-        sigmas = [section.sigma_xy_m, section.sigma_xy_m, section.sigma_theta_rad]
-    else:
-        sigmas = [*_three(section.sigma_position_m), *np.radians(_three(section.sigma_rotation_deg))]
-    for name in _known(section, behind):
-        key, axis = sigma_of(name)
-        sigma = getattr(section, key)
-        sigmas.append(_three(sigma)[axis] if isinstance(section, SpaceStartConfig) else sigma)
-    sigmas += [0.0] * (dof - len(sigmas))
-    return np.diag(np.square(sigmas[:dof])) if any(sigmas[:dof]) else None
-
-
-def sigma_of(name: str) -> tuple[str, int]:
-    """Return the key of a start with the sigma of what a state has behind its pose, and its axis, 0 of no axis."""
-    found = _AXIS.search(name)
-    return f"sigma_{_AXIS.sub('', name, count=1)}", "xyz".index(found[0][-1]) if found else 0
-
-
-def state_of(section: PlanePose | SpacePose, behind: tuple[str, ...]) -> list[float]:
-    """Return what a start says of a state behind its pose, by its names; empty if these are no keys of a start."""
-    return [getattr(section, name) for name in _known(section, behind)]
-
-
-def _known(section: PlanePose | SpacePose, behind: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of a state behind its pose, if a start has keys for all of them."""
-    return behind if {*behind} <= {*STATES["plane" if isinstance(section, PlanePose) else "space"]} else ()
-
-
 def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None:
     """Refuse what a start says of a state that its motion does not have.  Raises ValueError."""
-    has = _known(start, state_columns(model_of(motion)))
+    has = known(state_columns(model_of(motion)), world_of(vars(start)))
     allowed = {*has, *(sigma_of(name)[0] for name in has)}
     if isinstance(start, SpaceStartConfig) and start.at_rest:
         if "bias_ax_mps2" not in has:
@@ -313,7 +270,7 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
             raise expected(f"0: {motion.type} has no {what} in its state", "start", key)
 
 
-def _three(sigma: float | tuple[float, ...]) -> Array:
+def _three(sigma: float | tuple[float, ...]) -> Any:
     return np.broadcast_to(np.asarray(sigma, dtype=np.float64), 3)
 
 
@@ -416,6 +373,8 @@ class _AnyRobot(Section):
     """Greatest speed in a gap; from the controls so far if absent."""
     max_turn_radps: Positive | None = None
     """Greatest turn rate in a gap; from the controls so far if absent."""
+    rests_until_ns: int | None = None
+    """Controls up to this time do not move the robot; by `start.at_rest` if absent."""
 
     @model_validator(mode="after")
     def _start_fits(self) -> Self:

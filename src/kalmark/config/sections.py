@@ -273,8 +273,9 @@ def model_of(section: Any, world: str = "plane") -> Any:
     if section is None:
         return None
     model = class_of(section.of_role, section.of_name, section.of_world or world)
-    given = {own.name: value for own in parameters(model) if (value := getattr(section, own.name)) is not None}
-    return model(**given)
+    given = {own.name: getattr(section, own.name) for own in parameters(model)}
+    optional = {own.name for own in parameters(model) if own.optional and own.name in section.model_fields_set}
+    return model(**{name: value for name, value in given.items() if value is not None or name in optional})
 
 
 def _unpickled(role: str, name: str, world: str, plugin: Path | None) -> Section:

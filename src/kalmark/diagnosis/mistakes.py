@@ -209,6 +209,8 @@ def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> 
             section[key] = {}
         section = section[key]
     section[path[-1]] = value
+    if path[-1].startswith("sigma_"):
+        section.pop("cov", None)  # of a mount or a start: its sigmas as they were
     return changed
 
 

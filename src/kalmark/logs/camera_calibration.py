@@ -22,7 +22,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import shown
-from kalmark.logs.source import frame, mapping, nearest, number, placed
+from kalmark.geometry.named_poses import describe_pose
+from kalmark.logs.source import frame, mapping, nearest, number
 
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 LENSES = {
@@ -92,7 +93,7 @@ class _Calibration:
         k = self.intrinsics()
         section: dict[str, Any] = dict(zip(INTRINSICS, k, strict=True)) | self.size() | self.lens(k)
         mount = self.mount()
-        return section if mount is None else section | {"mount": placed(mount)}
+        return section if mount is None else section | {"mount": describe_pose(mount)}
 
     def intrinsics(self) -> list[float]:
         """Return fx, fy, cx, cy."""

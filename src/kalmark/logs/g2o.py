@@ -40,6 +40,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown, unit_quaternion
 from kalmark.geometry import frames, frames3d
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
@@ -50,7 +51,6 @@ from kalmark.logs.source import (
     landmark_id,
     number,
     one_robot,
-    placed,
     rows,
 )
 from kalmark.logs.table_columns import BEAM, INCREMENT2, INCREMENT3, POSITION
@@ -226,7 +226,7 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
         events.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=name, y=y, ids=[*first], cov=cov))
     sensor: dict[str, Any] = {"type": "position_3d" if space else "position"}
     if graph.offset is not None:
-        sensor["mount"] = placed(graph.offset)
+        sensor["mount"] = describe_pose(graph.offset)
     told: dict[str, Any] = {"motion": {"type": "odometry_3d" if space else "odometry_2d"}}
     there = {name for name, _ in graph.sights}
     told["sensors"] = {SENSOR: sensor} if SENSOR in there else {}

@@ -22,8 +22,9 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, order
 from kalmark.files import read_arrays, unpacked
 from kalmark.geometry.gaussian import sigma_probability
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Request, placed
+from kalmark.logs.source import Format, Request
 from kalmark.logs.table_columns import CORNERS, INCREMENT3, TWIST3
 
 NAME = "slamtb"
@@ -212,7 +213,7 @@ def motion(kind: str, noise: Array) -> dict[str, Any]:
 
 def start(settings: dict[str, Any], state: Array) -> dict[str, Any]:
     """Return where a robot starts; standard deviations of roll, pitch and yaw are taken about x, y and z."""
-    section: dict[str, Any] = placed(state[WXYZ_TO_XYZW]) | {
+    section: dict[str, Any] = describe_pose(state[WXYZ_TO_XYZW]) | {
         "sigma_position_m": numbers(settings["positionStd"]),
         "sigma_rotation_deg": numbers(settings["orientationStd"]),
     }
@@ -240,7 +241,7 @@ def camera(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
         else:
             section |= {"lens": "radial", "distortion": numbers(settings["distortion"])}
     section |= {"width_px": int(width), "height_px": int(height), "sigma_px": float(settings["pixErrorStd"])}
-    mount: dict[str, Any] = placed(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
+    mount: dict[str, Any] = describe_pose(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
     if settings["frameInMap"]:
         mount |= {"sigma_position_m": numbers(settings["positionStd"])}
         mount |= {"sigma_rotation_deg": numbers(settings["orientationStd"])}

@@ -278,21 +278,6 @@ def vector_frame(position: Any, vector: Any) -> Array:
     return np.append(np.asarray(position, dtype=np.float64).reshape(3), turn)
 
 
-def placed(pose: Array) -> dict[str, float]:
-    """Return a frame (7,) as a configuration gives mounts and starts: x_m, y_m, z_m, roll_deg, pitch_deg, yaw_deg."""
-    angles = np.degrees(rotations.to_euler(np.array(pose[3:], dtype=np.float64))[0]).round(12) + 0.0  # no -0
-    return dict(zip(POSE_KEYS, [*map(float, pose[:3]), *map(float, angles)], strict=True))
-
-
-POSE_KEYS = ("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg")
-
-
-def frame_of(section: Mapping[str, float]) -> Array:
-    """Return the frame (7,) of what `placed` returns; what is absent is 0."""
-    given = [float(section.get(key, 0.0)) for key in POSE_KEYS]
-    return np.append(given[:3], rotations.from_euler(np.radians(given[3:]))[0])
-
-
 def mapping(path: Path) -> dict[str, Any]:
     """Return the content of a YAML file, OpenCV's among them.  Raises LogError if it is none."""
     text = _OPENCV_HEAD.sub("", read_text(path)).replace("!!opencv-matrix", "")

@@ -16,9 +16,10 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.files import read_arrays
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.array_files import arrays, events_of, find_variables, refuse_shapes, times
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Request, choice, frame, one_robot, placed, quantity
+from kalmark.logs.source import Format, Request, choice, frame, one_robot, quantity
 from kalmark.logs.table_columns import TWIST3
 
 SENSOR = "stereo"
@@ -40,7 +41,7 @@ def described(camera: tuple[Any, ...], size: tuple[int, int], pixels: Any, mount
     stereo |= dict(zip(("width_px", "height_px"), size, strict=True))
     stereo |= {f"sigma_{name}": float(sigma) for name, sigma in zip(PIXELS, pixels, strict=True)}
     motion = {f"sigma_{name}": float(sigma) for name, sigma in zip(TWIST3, rates, strict=True)}
-    return {"motion": {"type": "velocity_3d"} | motion, "sensors": {SENSOR: stereo | {"mount": placed(mount)}}}
+    return {"motion": {"type": "velocity_3d"} | motion, "sensors": {SENSOR: stereo | {"mount": describe_pose(mount)}}}
 
 
 def log_of(

@@ -19,6 +19,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.rotations import matrix
 from kalmark.logs.bag.opening import Bag, stamp
 from kalmark.logs.camera_calibration import lens
@@ -32,7 +33,6 @@ from kalmark.logs.source import (
     mapping,
     nanoseconds,
     one_robot,
-    placed,
     quantity,
     vector_frame,
 )
@@ -359,7 +359,8 @@ def read(
     sections = {}
     for name, camera in known.items():
         if name in poses or name in guesses:
-            where = placed(poses[name]) if name in poses else placed(guesses[name]) | MOUNT_SIGMAS  # so calibrated
+            guess = {} if name in poses else MOUNT_SIGMAS  # so calibrated
+            where = describe_pose(poses[name] if name in poses else guesses[name]) | guess
             sections[name] = described_camera(camera, where, scene.pixel_noise)
         else:
             request.skipped.append(f"{path / 'cameras.yaml'}: {name}, whose pose on the rig is not given")
@@ -406,7 +407,7 @@ def robot(
 ) -> dict[str, Any]:
     """Return the section of the rig, which starts where the reference has it."""
     pose = None if reference.path is None else reference.path.at(scans[0].t_ns)
-    start: dict[str, Any] = placed(pose) if pose is not None and np.isfinite(pose).all() else {}
+    start: dict[str, Any] = describe_pose(pose) if pose is not None and np.isfinite(pose).all() else {}
     if moved is not None:
         return {"motion": {"type": "odometry_3d"}, "sensors": sections} | ({"start": start} if start else {})
     return {"motion": dict(MOTION), "start": start | VELOCITY, "sensors": sections}

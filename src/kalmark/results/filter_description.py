@@ -2,139 +2,43 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.config.schema import STATES, sigma_of
-from kalmark.declare import own_name, parameters, plugin_of, registered_name
+from kalmark.declare import plugin_of
 from kalmark.errors import MapError
 from kalmark.events import Scan
 from kalmark.geometry.frames3d import compose
-from kalmark.geometry.rotations import to_euler
 from kalmark.logs import FORMATS
 from kalmark.logs.log import Log
-from kalmark.models.landmark_views import Raised
-from kalmark.models.protocols import calibrating, parameter_names, state_columns
+from kalmark.models.protocols import calibrating, parameter_names
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import Biased, Camera, Measuring, Mounted
+from kalmark.slam.description import describe
 from kalmark.slam.held_control import bias_name
 
 if TYPE_CHECKING:
     from kalmark.report import Report
     from kalmark.slam.slam import Slam
 
-PARTS = ("landmark", "association", "detector", "initialization")  # of a mounted sensor, if it has its own
 HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has no focal length
 USED = ("associated", "new")
 
 
-def plain(value: Any) -> Any:
-    """Return a value made of dicts, lists, texts, numbers and None only, ready for YAML or JSON."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
-
-
-def model(value: Any) -> dict[str, Any]:
-    """Return the type and the parameters of a model, as a mapping."""
-    kind = type(value)
-    given = {own.name: vars(value)[own.name] for own in parameters(kind)}
-    name = registered_name(kind) or own_name(kind)  # file.py:Class for a user's own that has none
-    return {"type": name} | {key: plain(item) for key, item in given.items() if item is not None}
-
-
-def describe(slam: Any, log: Any = None) -> dict[str, Any]:
-    """Return the configuration of a Slam: log, robots, sensors, landmarks, association, estimator, map."""
-    out: dict[str, Any] = {}
-    settings = slam.state.settings
-    models = [settings.landmarks, slam.association, slam.estimator, *(robot.motion for robot in slam.robots.values())]
-    for mount in (mount for robot in slam.robots.values() for mount in robot.sensors.values()):
-        models += [mount.sensor, *(vars(mount)[part] for part in PARTS)]
-    own: list[Any] = [type(each) for each in models]
-    if isinstance(log, Log) and log.path is not None:
-        out["log"] = {"path": str(log.path), "format": log.format, "robots": list(log.robots)}
+def configuration(slam: Slam, log: Log) -> dict[str, Any]:
+    """Return the configuration that makes the run of a log by a Slam again: its plugins, the log, the filter."""
+    said: dict[str, Any] = {}
+    mounts = [mount for robot in slam.robots.values() for mount in robot.sensors.values()]
+    models = [each for part in (slam.state.settings, *slam.robots.values(), *mounts) for each in vars(part).values()]
+    own: list[Any] = [type(each) for each in models if not isinstance(each, np.ndarray | np.generic)]
+    if log.path is not None:
+        said["log"] = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)}
         own += [FORMATS[log.format].read] if log.format in FORMATS else []
     plugins = sorted({str(file) for each in own if (file := plugin_of(each)) is not None})
-    if plugins:
-        out["plugins"] = plugins
-    out["robots"] = {name: _robot(robot) for name, robot in slam.robots.items()}
-    if settings.landmarks is not None:
-        out["landmarks"] = model(settings.landmarks)
-    out["association"] = model(slam.association)
-    out["upkeep"] = _keys(settings.upkeep)
-    out["estimator"] = model(slam.estimator)
-    reparametrize = "off" if settings.reparametrize is None else float(settings.reparametrize)
-    out["longest_pause_s"] = settings.longest_pause_s
-    out["map"] = {"type": settings.map, "numbers": settings.numbers, "reparametrize": reparametrize}
-    return out
-
-
-def _keys(value: Any) -> dict[str, Any]:
-    return {key: value for key, value in model(value).items() if key != "type"}
-
-
-def _robot(robot: Any) -> dict[str, Any]:
-    pose, behind = 3 if robot.motion.space.world == "plane" else 7, state_columns(robot.motion)
-    start = describe_pose(robot.start[:pose])
-    start |= dict(zip(behind, plain(robot.start)[pose:], strict=False))
-    if robot.cov is not None:
-        start |= _sigmas(robot.cov, behind)
-    sensors = {name: _sensor(mount) for name, mount in robot.sensors.items()}
-    return {"motion": model(robot.motion), "start": start, "sensors": sensors}
-
-
-def _sensor(mount: Any) -> dict[str, Any]:
-    out, at = model(mount.sensor), describe_pose(mount.at)
-    if isinstance(mount.sensor, Raised):
-        at["z_m"] = out.pop("height_m")
-    if any(at.values()):
-        out["mount"] = at
-    for part in PARTS:
-        if vars(mount)[part] is not None:
-            out[part] = model(vars(mount)[part])
-    if mount.attention != type(mount.attention)():
-        out["attention"] = _keys(mount.attention)
-    if mount.robust is not None:
-        out["robust"] = mount.robust
-    if mount.upkeep is not None:
-        out["upkeep"] = _keys(mount.upkeep)
-    if mount.cov is not None:
-        out["mount"] = at | _sigmas(mount.cov)
-    return out
-
-
-def describe_pose(pose: Any) -> dict[str, float]:
-    """Return a pose as configuration files have it: (x, y, theta), in space (x, y, z, roll, pitch, yaw)."""
-    pose = [float(value) for value in pose]
-    if len(pose) == 3:
-        return dict(zip(("x_m", "y_m", "theta_rad"), pose, strict=True))
-    angles = np.degrees(to_euler(np.array(pose[3:7]))[0]).tolist()
-    return dict(zip(("x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg"), (*pose[:3], *angles), strict=True))
-
-
-def _sigmas(cov: Any, behind: tuple[str, ...] = ()) -> dict[str, float]:
-    """Return the sigmas of a covariance as configuration files have them, one for all axes.
-
-    `behind` are the names of what a state has behind its pose.
-    """
-    sigma = np.sqrt(np.diagonal(np.asarray(cov, dtype=np.float64))).tolist()
-    known = {*STATES["plane"], *STATES["space"]}
-    more = {
-        sigma_of(name)[0]: sigma[i]
-        for i, name in reversed([*enumerate(behind, len(sigma) - len(behind))])
-        if name in known
-    }
-    if len(sigma) - len(behind) == 3:
-        return {"sigma_xy_m": sigma[0], "sigma_theta_rad": sigma[2]} | more
-    return {"sigma_position_m": sigma[0], "sigma_rotation_deg": math.degrees(sigma[3])} | more
+    return ({"plugins": plugins} if plugins else {}) | said | describe(slam)
 
 
 @runtime_checkable

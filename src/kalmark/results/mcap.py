@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.geometry.rotations import from_euler, matrix
+from kalmark.geometry.named_poses import pose_of
+from kalmark.geometry.rotations import matrix
 from kalmark.logs.bag import tables, view
 from kalmark.logs.bag.mcap_writer import Outgoing, header, write_mcap
 from kalmark.results.history import MapSnapshot
@@ -80,17 +81,8 @@ def mounts(run: Run, t_ns: int) -> list[Outgoing]:
     robots, frames = run.config.get("robots") or {}, []
     for robot in run.history.robots:
         for sensor, section in ((robots.get(robot) or robots.get("each") or {}).get("sensors") or {}).items():
-            frames.append(view.transform(t_ns, robot, f"{robot}/{sensor}", mount(section.get("mount") or {})))
+            frames.append(view.transform(t_ns, robot, f"{robot}/{sensor}", pose_of(section.get("mount") or {})))
     return [tf("/tf_static", t_ns, frames)] if frames else []
-
-
-def mount(section: dict[str, Any]) -> Array:
-    """Return a mount of a configuration as a pose (3,) or (7,)."""
-    at = [float(section.get(key, 0.0)) for key in ("x_m", "y_m", "z_m")]
-    if not {"z_m", "roll_deg", "pitch_deg", "yaw_deg"} & section.keys():
-        return np.array([*at[:2], float(section.get("theta_rad", 0.0))])
-    turn = [np.radians(float(section.get(key, 0.0))) for key in ("roll_deg", "pitch_deg", "yaw_deg")]
-    return np.append(at, from_euler(np.array(turn))[0])
 
 
 def maps(run: Run) -> Iterator[Outgoing]:

@@ -19,7 +19,7 @@ from kalmark.logs.progress import track
 from kalmark.logs.source import nearest
 from kalmark.report import Report
 from kalmark.results.control_gaps import joined
-from kalmark.results.filter_description import biases, cameras, describe, left_px, mounts, plain, sensors, stated_noise
+from kalmark.results.filter_description import biases, cameras, configuration, left_px, mounts, sensors, stated_noise
 from kalmark.results.history import (
     Change,
     Controlled,
@@ -38,6 +38,7 @@ from kalmark.results.repeated_landmarks import repeated
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
 from kalmark.results.unmeasured import Foresight
+from kalmark.slam.description import plain
 from kalmark.slam.held_control import HeldInput
 
 if TYPE_CHECKING:
@@ -234,7 +235,7 @@ class _Recorder:
         history = self._history()
         return Run(
             history=history,
-            config=dict(config) if config is not None else describe(slam, log),
+            config=dict(config) if config is not None else configuration(slam, log),
             landmarks=MapLandmarks.of(slam),
             truth=Truth.of(log, history, self.anchored),
             log=LogReference(log.name, log.format, None if log.path is None else str(log.path), tuple(log.robots)),

@@ -30,10 +30,10 @@ from kalmark.events import listed, shown
 from kalmark.files import locked, read_arrays, refuse_aliases, replace_file, write
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of, seconds
-from kalmark.results.filter_description import plain
 from kalmark.results.history import History
 from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.truth import Truth
+from kalmark.slam.description import plain
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log

@@ -15,8 +15,8 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import unit_of
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.results.figure_texts import figure
-from kalmark.results.filter_description import describe_pose
 from kalmark.results.history import Biased, Mounted
 
 AXES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}

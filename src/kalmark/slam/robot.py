@@ -11,6 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.association.protocol import Association
+from kalmark.declare import parameters
 from kalmark.errors import ModelError
 from kalmark.events import MOST, ROUNDED, Scan, finite, is_writable, shown, unit_quaternion
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
@@ -93,6 +94,10 @@ class Mount:
             searches = isinstance(self.detector, SearchingDetector)
             one = "an object like km.detect.Trunks(), or a function"
             able(self.detector, ("front_end" if searches else "__call__",), "Mount: detector", one)
+            declared = {own.name for own in parameters(type(self.detector))}
+            if "signature" in declared and vars(self.detector)["signature"] is None:
+                chosen: Any = replace(self.detector, signature="signature" in self.sensor.columns)  # type: ignore[type-var]
+                object.__setattr__(self, "detector", chosen)
         instance(self.attention, Attention, "Mount: attention", "an Attention")
         if self.upkeep is not None:
             instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")

@@ -1,7 +1,7 @@
 """A Slam on disk: one zip of arrays, a JSON description and their checksums, never pickle: loading runs nothing of it.
 
 The settings are what a Slam is constructed with, the state is what events have made of it.  Registered models are saved
-by name and parameters, others by name alone, to be given again.
+by name and parameters, in the keys of a configuration; others are to be given again.
 """
 
 from __future__ import annotations
@@ -11,51 +11,40 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import kalmark.association
-import kalmark.filter.estimators
-import kalmark.management.attention
-import kalmark.management.initialization
-import kalmark.management.upkeep
-import kalmark.models.landmarks
-import kalmark.models.motion
-import kalmark.models.sensors  # noqa: F401 - all of these register what a file names
 from kalmark.arrays import Array
-from kalmark.association import Association
-from kalmark.declare import by_class_name, registered_name
+from kalmark.declare import class_of, class_of_file, classes
 from kalmark.errors import KalmarkError, MapError
-from kalmark.events import LONGEST_PAUSE_S, Id
+from kalmark.events import Id
 from kalmark.files import refuse_bomb, replace_file
-from kalmark.filter.estimators import Estimator
 from kalmark.filter.maps import restored as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
 from kalmark.slam.alternative import Alternative, alone
+from kalmark.slam.description import Description, describe, model
+from kalmark.slam.estimate import Estimate
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import Mean, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import Given
 from kalmark.slam.reader import Reader
 from kalmark.slam.replacing import LeftOut
-from kalmark.slam.robot import Mount, Robot, mount_name
-from kalmark.slam.state import Settings, State
+from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.clones import Clone, Clones, Measurement
 from kalmark.tracks.looks import Looks
 from kalmark.tracks.track import ChannelKey, Pending, Status, Track, Tracks
 
-Description = dict[str, Any]
-
-VERSION = 15
+VERSION = 16
 DESCRIPTION, SUMS = "slam.json", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
 OF_TRACKS = (
@@ -68,30 +57,16 @@ OF_TRACKS = (
     "looked",
     "detection",
 )  # beside the tracks
-PARTS = ("sensor", "landmark", "association", "detector", "attention", "upkeep", "initialization")  # of a mount
 NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no word for them
-MODELS = ("association", "estimator", "landmarks", "upkeep")  # among the settings
-OF_ROBOT = ("gaps", "max_speed_mps", "max_turn_radps", "rests_until_ns")
-
-
-def _settings(state: State) -> Description:
-    """Return a description of what a Slam was constructed with."""
-    said = {key: value for key, value in vars(state.settings).items() if key not in MODELS}
-    models = {role: getattr(state.settings, role) for role in MODELS}
-    return {
-        "robots": [robot_described(robot) for robot in state.robots.values()],
-        **{role: None if model is None else described(model) for role, model in models.items()},
-        **said,
-    }
 
 
 # ---------------------------------------------------------------------- saving
-def save(path: Path, state: State) -> None:
+def save(path: Path, slam: Estimate) -> None:
     """Write settings and state; the file appears whole or not at all.  A model's own memory is not written.
 
     Raises MapError if the file cannot be written, or an id is neither an integer nor a text.
     """
-    members = members_of(state, {"kalmark": VERSION, "settings": _settings(state)})
+    members = members_of(slam.state, {"kalmark": VERSION, "settings": _each(describe(slam), _to_text)})
     sums = "".join(f"{hashlib.sha256(data).hexdigest()}  {name}\n" for name, data in members.items()).encode()
 
     def pack(file: Path) -> None:
@@ -114,9 +89,7 @@ def members_of(state: State, head: Description) -> dict[str, bytes]:
 
 def fill(state: State, members: dict[str, bytes]) -> None:
     """Fill a state as it is after construction with what `members_of` returned."""
-    own = state.settings.landmarks
-    said = json.loads(members[DESCRIPTION])["state"]
-    Saved(Path(), [*state.robots.values()], state.settings, said, members, own).fill(state)
+    _Saved(json.loads(members[DESCRIPTION])["state"], members, state.settings.landmarks).fill(state)
 
 
 def _state(state: State) -> Description:
@@ -125,6 +98,7 @@ def _state(state: State) -> Description:
     blocks = {name: slot for name, slot in tracks.slots.items() if name not in tracks.confirmed}
     return {
         "t_ns": state.t_ns,
+        "columns": _columns(state.robots),
         "taken": sorted(map(list, state.taken)),
         "placed": state.placed,
         "map": state.map.state(),
@@ -164,6 +138,10 @@ def _state(state: State) -> Description:
     }
 
 
+def _columns(robots: dict[str, Robot]) -> dict[str, list[str]]:
+    return {name: list(robot.motion.columns) for name, robot in robots.items()}
+
+
 def _moving(m: Moving) -> list[Any]:
     gaps = None if m.held.gaps is None else m.held.gaps.state()
     number = 0 if m.held.mean is None else m.held.mean.number
@@ -177,18 +155,16 @@ def _record(value: Any) -> Description:
 
 def _plain(value: Any) -> Any:
     """Return what JSON has no word for: arrays as lists, records as their fields, models as they are described."""
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
     if isinstance(value, set | frozenset):
-        return sorted(map(_id, value), key=str) if not all(isinstance(v, tuple) for v in value) else sorted(value)
+        return sorted(value, key=str)
     if isinstance(value, Status):
         return value.value
     if isinstance(value, Measurement | Pending):
         return _record(value)
     if isinstance(value, Landmark):
-        return described(value)
+        return _each(model(value), _to_text)
     raise MapError(f"{value!r} cannot be saved, expected a number or a text")
 
 
@@ -255,15 +231,12 @@ def errors(path: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Saved:
-    """A file that was written by `save`: the settings to construct a Slam with, and the state it then takes over."""
+class _Saved:
+    """What a Slam takes over once it is constructed as it was; `_landmarks` are the user's own, given again."""
 
-    path: Path
-    robots: list[Robot]
-    settings: Settings
     _state: Description
     _members: dict[str, bytes]
-    _landmarks: Landmark | None = None  # the user's own, given again
+    _landmarks: Landmark | None = None
 
     def fill(self, state: State) -> None:
         """Fill a state as it is after construction.  Raises MapError if the parts do not fit together."""
@@ -272,16 +245,19 @@ class Saved:
             given.append(self._landmarks)
         map_ = restored_map(s["map"], partial(_array, self._members))
         robots, tracks, clones = state.robots, Tracks(state.robots), Clones()
+        world = next(iter(robots.values())).motion.space.world
+        _check_columns(robots, s["columns"])
         state.t_ns, state.map, state.tracks, state.clones = _time(s["t_ns"]), map_, tracks, clones
         state.placed = _count(s["placed"], "placed")
         state.taken = {(str(kind), str(robot), str(sensor)) for kind, robot, sensor in s.get("taken", ())}
         for name, slot in s["blocks"]:
             tracks.enter_block(name, slot, robot=name in robots)
         for record in s["tracks"]:
-            _enter(tracks, _track(record, given), len(map_.spaces))
+            landmark = _landmark(record["model"], given, world, f"landmark {record['id']!r}")
+            _enter(tracks, _track(record, landmark), len(map_.spaces))
         for robot, sensor, candidates in s["candidates"]:
             tracks.candidates[robot, sensor] = [_pending(c) for c in candidates]
-        self._enter_known(tracks, given)
+        self._enter_known(tracks, given, world)
         tracks.reserve(s["reserved"])
         for name in OF_TRACKS:
             setattr(tracks, name, s[name])
@@ -359,46 +335,40 @@ class Saved:
             if m.held.gaps is not None:
                 m.held.gaps.restore(_watching(watched, k))
 
-    def _enter_known(self, tracks: Tracks, own: Sequence[Landmark]) -> None:
+    def _enter_known(self, tracks: Tracks, own: Sequence[Landmark], world: str) -> None:
         """Enter the landmarks known exactly.  Raises MapError where one is there twice."""
         for i, of in enumerate(self._state["known"]):
-            model = _model(of["model"], own, f"landmark {next(iter(of['names']), '')!r}")
-            values = _array(self._members, f"known{i}", (len(of["names"]), model.space.size))
+            kind = _landmark(of["model"], own, world, f"landmark {next(iter(of['names']), '')!r}")
+            values = _array(self._members, f"known{i}", (len(of["names"]), kind.space.size))
             for name, value, count in zip(of["names"], values, of["counts"], strict=True):
                 if name in tracks.slots or name in tracks.known:
                     raise MapError(f"landmark {name!r} is there twice, expected each name once")
-                tracks.known.add(name, model, value)
+                tracks.known.add(name, kind, value)
                 tracks.known.recount(name, _count(count, f"observations of {name!r}"))
 
 
-def load(
-    path: Path, robots: Iterable[Robot] | None, association: Association | None, estimator: Estimator | None,
-    landmarks: Landmark | None,
-) -> Saved:  # fmt: skip
-    """Read a file written by `save`; models of the user's own are given again.
+def load(path: Path, built: Callable[..., Any], robots: Iterable[Robot] | None, **models: Any) -> Any:
+    """Return the Slam of a file written by `save`, `built` by its description; a user's own models are given again.
 
     Raises MapError if the file is damaged, lacks a model, or was saved with other robots or landmarks.
     """
     with errors(path):
         description, members = _read(path)
-        s, state = description["settings"], description["state"]
-        settings = Settings(
-            **{
-                "association": association or restored("association", s["association"], "association", "association"),
-                "estimator": estimator or restored("estimator", s["estimator"], "estimator", "estimator"),
-                "landmarks": landmark_type(
-                    s["landmarks"], [t["model"] for t in (*state["tracks"], *state["known"])], landmarks
-                ),
-                "map": s["map"],
-                "numbers": s["numbers"],
-                "reparametrize": _optional(s["reparametrize"], "reparametrize", "a number", int, float),
-                "upkeep": restored("upkeep", s["upkeep"], "upkeep", "upkeep"),
-                "longest_pause_s": s.get("longest_pause_s", LONGEST_PAUSE_S),
-            }
-        )
-        made = robots_restored(s["robots"], None if robots is None else list(robots))
-        return Saved(path, made, settings, state, members, landmarks)
-    raise AssertionError  # `errors` has raised
+        said, state = _each(description["settings"], _to_number), description["state"]
+        own = models["landmarks"]
+        of_tracks = [track["model"] for track in (*state["tracks"], *state["known"])]
+        if own is not None and not is_type(own, said["landmarks"]):
+            if not any(is_type(own, each) for each in of_tracks):
+                names = sorted({_name(each) for each in (said["landmarks"], *of_tracks) if each is not None})
+                raise MapError(f"landmarks is {type(own).__name__}, expected {' or '.join(names) or 'None'}")
+            del models["landmarks"]
+        given = {name: each for name, each in models.items() if each is not None}
+        if robots is not None:
+            given["robots"] = _same_robots([*robots], said["robots"])
+        _refuse_own({name: each for name, each in said.items() if name not in given})
+        slam = built(said, **given)
+        _Saved(state, members, own).fill(slam.state)
+        return slam
 
 
 def _read(path: Path) -> tuple[Description, dict[str, bytes]]:
@@ -436,12 +406,10 @@ def _enter(tracks: Tracks, track: Track, slots: int) -> None:
         of[track.id] = track
 
 
-def _track(record: Description, own: Sequence[Landmark]) -> Track:
-    name = record["id"]
-    model = _model(record["model"], own, f"landmark {name!r}")
-    pending = record["pending"]
+def _track(record: Description, landmark: Landmark) -> Track:
+    name, pending = record["id"], record["pending"]
     changed = {
-        "model": model,
+        "model": landmark,
         "status": Status(record["status"]),
         "observations": _count(record["observations"], f"observations of {name!r}"),
         "covisible": set(record["covisible"]),
@@ -456,13 +424,6 @@ def _track(record: Description, own: Sequence[Landmark]) -> Track:
     for what in ("searched", "found", "hits", "chances", "seen"):
         _count(getattr(track, what), f"{what} of {name!r}")
     return track
-
-
-def _model(record: Description, own: Sequence[Landmark], what: str) -> Landmark:
-    """Return the model of a landmark: one of the user's `own`, or the registered one that a file describes."""
-    model = next((landmark for landmark in own if same(landmark, record)), None)
-    found: Landmark = model or restored("landmark", record, what, "landmarks")
-    return found
 
 
 def _pending(record: Description) -> Pending:
@@ -512,6 +473,13 @@ def _numbers(value: Any) -> Array:
     if not np.isfinite(found).all():
         raise MapError(f"{value!r} is no array of finite numbers")
     return found
+
+
+def _check_columns(robots: dict[str, Robot], saved: dict[str, list[str]]) -> None:
+    """Refuse motions that take other controls than those saved."""
+    columns = _columns(robots)
+    if columns != saved:
+        raise MapError(f"columns of the motions are {columns}, expected {saved}")
 
 
 def _check_owners(state: State) -> None:
@@ -579,107 +547,66 @@ def _time(value: Any) -> int | None:
 
 
 # ---------------------------------------------------------------------- models and robots
-def described(model: Any) -> Description:
-    """Return a model that has a name in configurations as its class and parameters, another as its class alone."""
-    name = type(model).__name__
-    if registered_name(type(model)) is None:
-        return {"python": name, "kind": model.kind if isinstance(model, Landmark) else ""}
-    return {"type": name, **{f.name: _parameter(vars(model)[f.name]) for f in fields(model)}}
+def _each(value: Any, change: Callable[[Any], Any]) -> Any:
+    """Return a description with each of its values changed."""
+    if isinstance(value, dict):
+        return {key: _each(item, change) for key, item in value.items()}
+    return [_each(item, change) for item in value] if isinstance(value, list) else change(value)
 
 
-def _parameter(value: Any) -> Any:
-    """Return NumPy's numbers as Python's, and those JSON has no word for as text."""
-    if isinstance(value, tuple):
-        return [_parameter(v) for v in value]
-    value = value.item() if isinstance(value, np.generic) else value
+def _to_text(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def restored(kind: str, description: Description, what: str, argument: str) -> Any:
-    """Make a registered model again; of another, say which argument of `load` has to give it."""
-    if "python" in description:
-        raise MapError(f"{what} is {_name(description)}, a model of your own: give the {argument} to load() again")
-    model = by_class_name(kind, description["type"])
-    if model is None and kind == "detector":
-        import_module("kalmark.vision")  # by name: it stands above
-        model = by_class_name(kind, description["type"])
-    if model is None:
-        raise MapError(f"{what} is {description['type']!r}, expected one of kalmark's, or of a plugin that is loaded")
-    parameters = {k: v for k, v in description.items() if k != "type"}
-    return model(**{k: float(v) if v in NOT_FINITE else v for k, v in parameters.items()})
+def _to_number(value: Any) -> Any:
+    return float(value) if value in NOT_FINITE else value
 
 
-def _name(description: Description) -> str:
-    return str(description.get("type") or description["python"])
+def _landmark(said: Description, own: Sequence[Landmark], world: str, what: str) -> Landmark:
+    """Return the model of a landmark: one of a user's `own`, or the registered one that is described."""
+    like = [each for each in own if is_type(each, said)]
+    found = next((each for each in like if _each(model(each), _to_text) == said), None)
+    if said["type"] in classes("landmark") and found is None:
+        given = {key: value for key, value in _each(said, _to_number).items() if key != "type"}
+        made: Landmark = class_of("landmark", said["type"], world)(**given)
+        return made
+    if not like:
+        raise MapError(f"{what} is {_name(said)}, a model of your own: give the landmarks to load() again")
+    return found or like[0]
 
 
-def same(landmark: Any, description: Description | None) -> bool:
+def is_type(landmark: Landmark, description: Description | None) -> bool:
     """Return whether a landmark type is the one that was saved."""
-    if description is None:
-        return False
-    mine = described(landmark)
-    return _name(mine) == _name(description) and mine.get("kind") == description.get("kind")
+    return description is not None and model(landmark)["type"] == description["type"]
 
 
-def robot_described(robot: Robot) -> Description:
-    """Return a robot with its motion, its start and its mounted sensors."""
-    mounts = [
-        [name, {"at": list(mount.at), "cov": _listed(mount.cov), "robust": mount.robust, **_parts(mount)}]
-        for name, mount in robot.sensors.items()
-    ]
-    moved = {"motion": described(robot.motion), "columns": list(robot.motion.columns)}
-    watched = {key: vars(robot)[key] for key in OF_ROBOT}
-    start = {"start": list(robot.start), "cov": _listed(robot.cov)}
-    return {"name": robot.name, **moved, **start, **watched, "sensors": mounts}
+def _refuse_own(said: Any, path: tuple[str, ...] = ()) -> None:
+    """Refuse a description of a model of the user's own that has no name in this program."""
+    for key, value in said.items():
+        if isinstance(value, dict):
+            _refuse_own(value, (*path, key))
+        elif key == "type" and ":" in value and class_of_file(value) is None:
+            what = f"{'.'.join(path)} is {_name(said)}, a model of your own"
+            raise MapError(f"{what}: give the {path[0]} to load() again")
 
 
-def _parts(mount: Mount) -> Description:
-    return {role: None if (model := vars(mount)[role]) is None else described(model) for role in PARTS}
-
-
-def _listed(cov: Any) -> Any:
-    return None if cov is None else np.asarray(cov).tolist()
-
-
-def _robot_restored(d: Description) -> Robot:
-    who, mounts = f"robot {d['name']!r}", {}
-    for name, m in d["sensors"]:
-        what = f"{who}: sensor {name!r}"
-        said = {"sensor": what} | {role: f"{what}: {role}" for role in PARTS[1:]}
-        parts = {role: restored(role, m[role], said[role], "robots") for role in PARTS if m.get(role) is not None}
-        mounts[name] = Mount(at=m["at"], cov=m["cov"], robust=m.get("robust"), **parts)
-    motion = restored("motion", d["motion"], f"{who}: motion", "robots")
-    return Robot(d["name"], motion, d["start"], mounts, d["cov"], **{key: d[key] for key in OF_ROBOT if key in d})
-
-
-def robots_restored(saved: list[Description], given: list[Robot] | None) -> list[Robot]:
-    """Return the robots in the order saved: restored, or those given again if they are the same."""
-    if given is None:
-        return [_robot_restored(d) for d in saved]
+def _same_robots(given: list[Any], saved: Description) -> list[Robot]:
+    """Return the robots given again in the order saved.  Raises MapError where they are others."""
     for robot in given:
         if not isinstance(robot, Robot):
             raise MapError(f"robots holds {robot!r}, expected nothing but robots")
-    names = [d["name"] for d in saved]
-    got = [robot.name for robot in given]
+    names, got = [*saved], [robot.name for robot in given]
     if sorted(got) != sorted(names):
         raise MapError(f"robots are {got}, expected {names}")
-    given = sorted(given, key=lambda robot: names.index(robot.name))
-    for robot, d in zip(given, saved, strict=True):
+    for robot in given:
         for what, mine, expected in (
-            ("motion is", type(robot.motion).__name__, _name(d["motion"])),
-            ("columns of the motion are", list(robot.motion.columns), d["columns"]),
-            ("sensors are", sorted(map(str, robot.sensors)), sorted(str(name) for name, _ in d["sensors"])),
+            ("motion is", model(robot.motion)["type"], saved[robot.name]["motion"]["type"]),
+            ("sensors are", sorted(robot.sensors), sorted(saved[robot.name]["sensors"])),
         ):
             if mine != expected:
                 raise MapError(f"robot {robot.name!r}: {what} {mine}, expected {expected}")
-    return given
+    return sorted(given, key=lambda robot: names.index(robot.name))
 
 
-def landmark_type(saved: Description | None, of_tracks: list[Description], given: Landmark | None) -> Landmark | None:
-    """Return the slam's type of landmark; one given again must be one that was saved, of the slam or of a track."""
-    if given is not None and same(given, saved):
-        return given
-    if given is not None and not any(same(given, d) for d in of_tracks):
-        names = sorted({_name(d) for d in (saved, *of_tracks) if d is not None})
-        raise MapError(f"landmarks is {type(given).__name__}, expected {' or '.join(names) or 'None'}")
-    return None if saved is None else restored("landmark", saved, "landmarks", "landmarks")
+def _name(description: Description) -> str:
+    return str(description["type"]).rpartition(":")[2]

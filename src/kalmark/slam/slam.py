@@ -451,7 +451,7 @@ class Slam(Estimate):
         """Write the whole state to a file; `load` resumes bit for bit."""
         from kalmark.slam import saving
 
-        saving.save(Path(path), self.state)
+        saving.save(Path(path), self)
 
     @staticmethod
     def load(
@@ -464,11 +464,10 @@ class Slam(Estimate):
         """Read a state written by `save`; what is not kalmark's own (a user's models) must be given again."""
         from kalmark.slam import saving
 
-        saved = saving.load(Path(path), robots, association, estimator, landmarks)
-        with saving.errors(saved.path):
-            slam = Slam(saved.robots, **vars(saved.settings))
-            saved.fill(slam.state)
-        return slam
+        own = {"association": association, "estimator": estimator, "landmarks": landmarks}
+        config = import_module("kalmark.config")  # by name: it stands above
+        loaded: Slam = saving.load(Path(path), config.slam_described, robots, **own)
+        return loaded
 
     def __reduce__(self) -> tuple[Callable[..., Slam], tuple[Any, ...]]:
         """Return how a copy is made, by `copy` or `pickle`: made anew, with the state that `save` writes."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry import rotations
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.bag.configured_topics import sensor_name
 from kalmark.logs.bag.first_sensors import mount_of
 from kalmark.logs.bag.first_start import Start
@@ -19,7 +20,6 @@ from kalmark.logs.bag.messages import Measured
 from kalmark.logs.bag.survey import Survey, TopicSummary
 from kalmark.logs.bag.tf_mounts import LEVEL
 from kalmark.logs.bag.topics import Scans
-from kalmark.logs.source import placed
 
 HEADING_S, HEADING_RAD = 1.0, 0.02
 """Headings are taken so often, and are not believed to be better: errors of a compass last."""
@@ -81,7 +81,7 @@ class Readings:
         """Return what an entry says of a mount that gravity shows."""
         if mount_of(self.found, topic, self.control) is not None or (mount := self.mount(topic)) is None:
             return {}
-        turned = placed(mount)
+        turned = describe_pose(mount)
         return {"mount": {key: round(turned[key], 2) for key in ("roll_deg", "pitch_deg")}}
 
     def unused(self, topic: TopicSummary) -> str:

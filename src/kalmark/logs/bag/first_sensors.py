@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.bag.configured_topics import sensor_name
 from kalmark.logs.bag.first_words import GUESS, mapping
 from kalmark.logs.bag.survey import Survey, TopicSummary
 from kalmark.logs.bag.topics import Scans
-from kalmark.logs.source import placed
 from kalmark.logs.table_columns import BEAM, CORNERS, POSE3, POSITION
 
 CAMERA = {"fx_px": 600.0, "fy_px": 600.0, "cx_px": 640.0, "cy_px": 512.0, "width_px": 1280, "height_px": 1024}
@@ -46,7 +46,7 @@ def line_of(found: Survey, topic: TopicSummary, control: Any, space: bool) -> st
     mount = mount_of(found, topic, control)
     section, why = model(found, topic, space)
     if mount is None:
-        section["mount"] = dict.fromkeys(placed(np.array([0.0] * 6 + [1.0])), 0.0) if space else {
+        section["mount"] = dict.fromkeys(describe_pose(np.array([0.0] * 6 + [1.0])), 0.0) if space else {
             "x_m": 0.0, "y_m": 0.0, "theta_rad": 0.0}  # fmt: skip
         why = f"{why}; {GUESS} the mount: tf does not have {topic.frame or 'its frame'}".removeprefix("; ")
     else:

@@ -8,12 +8,13 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry import rotations
+from kalmark.geometry.named_poses import describe_pose, pose_of
 from kalmark.logs.bag.configured_topics import Asked, beams_of
 from kalmark.logs.bag.messages import MESSAGES
 from kalmark.logs.bag.opening import frame_id
 from kalmark.logs.bag.tf_frames import Frames
 from kalmark.logs.bag.topics import Carried, InertialTopic, Posed, Topic
-from kalmark.logs.source import Request, frame_of, placed
+from kalmark.logs.source import Request
 
 LEVEL = math.cos(math.radians(5))  # a sensor tilted by less is taken as level
 
@@ -60,12 +61,12 @@ class Mounts:
         frame = self.of_sensor.get(name, "")
         base = self.frames.base((scan.base_frame, self.base.get(scan.robot)), frame)
         given = scan.mounted()
-        mount = frame_of(given) if given else None if base is None else self.frames.fixed(base, frame)
+        mount = pose_of(given) if given else None if base is None else self.frames.fixed(base, frame)
         if mount is None:
             return
         keys = [(scan.robot, sensor) for sensor in scan.sensors(name)]
         if self.asked.in_space(scan.robot):
-            self.mounts |= dict.fromkeys(keys, placed(mount))
+            self.mounts |= dict.fromkeys(keys, describe_pose(mount))
             return
         R = rotations.matrix(mount[3:])
         yaw = float(np.arctan2(R[1, 0], R[0, 0]))

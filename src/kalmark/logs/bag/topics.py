@@ -14,7 +14,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from kalmark.declare import Number, Within, class_of, classes, declared, parameters, refuse, register
 from kalmark.errors import LogError, ModelError
 from kalmark.events import Id, is_number, shown
-from kalmark.logs.source import POSE_KEYS, landmark_id, nanoseconds, nearest
+from kalmark.geometry.named_poses import POSES
+from kalmark.logs.source import landmark_id, nanoseconds, nearest
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 
 
@@ -137,8 +138,8 @@ class Carried(Topic):
         """Return its pose in the robot as given, None if it is not.  Raises ModelError."""
         given = self.mount
         numbers = isinstance(given, Mapping) and all(is_number(v) and math.isfinite(v) for v in given.values())
-        if given is not None and not (numbers and {*given} <= {*POSE_KEYS}):
-            raise refuse(self, "mount", f"a mapping of numbers with keys among {', '.join(POSE_KEYS)}")
+        if given is not None and not (numbers and {*given} <= {*POSES["space"]}):
+            raise refuse(self, "mount", f"a mapping of numbers with keys among {', '.join(POSES['space'])}")
         return None if given is None else dict(given)
 
     def sensors(self, topic: str) -> tuple[str, ...]:

@@ -17,11 +17,12 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Frame, shown
 from kalmark.files import unpacked
+from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.images.image_files import frames_of
 from kalmark.logs.images.rigs import MOTION, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Times, Trajectory, interpolate
-from kalmark.logs.source import Format, Request, choice, nearest, number, placed, read_text
+from kalmark.logs.source import Format, Request, choice, nearest, number, read_text
 from kalmark.logs.table_columns import INERTIAL, TWIST3
 from kalmark.models.motion import shaken
 
@@ -175,7 +176,7 @@ def started(states: Table, t_ns: int) -> dict[str, Any] | None:
     a, b = states.rows[before], states.rows[after]
     pose = interpolate(a[None, :7], b[None, :7], np.array([share]))[0]
     rest = a[7:] + share * (b[7:] - a[7:])
-    return placed(pose) | dict(zip((*TWIST3[:3], *BIASES), map(float, rest), strict=True)) | SURE
+    return describe_pose(pose) | dict(zip((*TWIST3[:3], *BIASES), map(float, rest), strict=True)) | SURE
 
 
 def data_sheet(file: Path) -> dict[str, float]:

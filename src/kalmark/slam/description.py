@@ -1,0 +1,146 @@
+"""The description of a Slam in data, by the keys of a configuration: a run's `config.yaml` and a saved map have it.
+
+It follows from the declarations: the fields of `Robot`, `Mount` and `Settings` and the parameters of models.  A pose or
+a covariance that the readable keys (angles in degrees, one sigma a coordinate) do not give to the last bit has an exact
+key beside them: `quaternion`, `state` or `cov`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.declare import own_name, parameters, registered_name
+from kalmark.geometry.named_poses import describe_pose, pose_of, world_of
+from kalmark.models.landmark_views import Raised
+from kalmark.models.protocols import state_columns
+from kalmark.slam.estimate import Estimate
+from kalmark.slam.robot import Mount, Robot
+
+Description = dict[str, Any]
+
+STATES = {
+    "plane": ("vx_mps", "vy_mps", "w_radps", "slip"),
+    "space": (
+        "vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps",
+        "bias_wx_radps", "bias_wy_radps", "bias_wz_radps", "bias_ax_mps2", "bias_ay_mps2", "bias_az_mps2",
+        "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
+    ),
+}  # fmt: skip
+"""What a state may have behind its pose, as keys of a start."""
+SIGMAS = {
+    "plane": (("sigma_xy_m", 0), ("sigma_xy_m", 1), ("sigma_theta_rad", 0)),
+    "space": (*(("sigma_position_m", k) for k in range(3)), *(("sigma_rotation_deg", k) for k in range(3))),
+}
+"""The keys of the sigmas of a pose and their axes."""
+EXACT = ("quaternion", "state", "cov")
+UNTYPED = ("attention", "upkeep")  # roles of one model: their sections have no `type`
+OF_PLACE = ("name", "motion", "start", "sensors", "sensor", "at", "cov")  # fields that are more than one key
+_AXIS = re.compile(r"(?:_|(?<=[vwa]))[xyz](?=_)")  # of a key: vx_mps, gravity_x_mps2
+
+
+def describe(slam: Estimate) -> Description:
+    """Return a Slam as a configuration has it: robots, landmarks, association, upkeep, estimator, map."""
+    out = {name: _described(value) for name, value in vars(slam.state.settings).items()}
+    linear = out.pop("reparametrize")
+    kept = {"type": out.pop("map"), "numbers": out.pop("numbers"), "reparametrize": "off" if linear is None else linear}
+    return {"robots": {name: _robot(robot) for name, robot in slam.robots.items()}, **out, "map": kept}
+
+
+def plain(value: Any) -> Any:
+    """Return a value made of dicts, lists, texts, numbers and None only, ready for YAML or JSON."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def model(value: Any) -> Description:
+    """Return the type and the parameters of a model; a class without a name in configurations is file.py:Class."""
+    name = registered_name(type(value)) or own_name(type(value))
+    given = {own.name: plain(vars(value)[own.name]) for own in parameters(type(value))}
+    return given if name in UNTYPED else {"type": name} | given
+
+
+def _described(value: Any) -> Any:
+    return plain(value) if isinstance(value, bool | int | float | str | np.generic | None) else model(value)
+
+
+def _robot(robot: Robot) -> Description:
+    world = robot.motion.space.world
+    start = describe_place(robot.start, world, robot.cov, state_columns(robot.motion))
+    own = {name: _described(value) for name, value in vars(robot).items() if name not in OF_PLACE}
+    sensors = {name: _mount(mount, world) for name, mount in robot.sensors.items()}
+    return {"motion": model(robot.motion), "start": start, **own, "sensors": sensors}
+
+
+def _mount(mount: Mount, world: str) -> Description:
+    out, place = model(mount.sensor), describe_place(mount.at, world, mount.cov)
+    if isinstance(mount.sensor, Raised):
+        place["z_m"] = out.pop("height_m")
+    own = {name: _described(value) for name, value in vars(mount).items() if name not in OF_PLACE}
+    own["initialization"] = own["initialization"] or {"type": "immediate"}
+    return out | {"mount": place} | own
+
+
+# ---------------------------------------------------------------------- mounts and starts
+def describe_place(at: Any, world: str, cov: Any = None, behind: tuple[str, ...] = ()) -> Description:
+    """Return a mount or a start `at` a pose, or with a whole state, and its covariance, by the keys of its section.
+
+    `behind` are the names of what the state has behind its pose.
+    """
+    at, pose, names = np.asarray(at, dtype=np.float64), 3 if world == "plane" else 7, known(behind, world)
+    said: Description = describe_pose(at[:pose]) | dict(zip(names, at[pose:].tolist(), strict=False))
+    P = np.zeros((0, 0)) if cov is None else np.asarray(cov, dtype=np.float64)
+    keys, sigmas = [*SIGMAS[world], *map(sigma_of, names)], np.zeros(len(at))
+    sigmas[: len(P)] = np.sqrt(np.maximum(np.diagonal(P), 0.0))
+    by_key: dict[str, list[float]] = {}
+    for (key, axis), sigma in zip(keys, sigmas.tolist(), strict=False):
+        by_key.setdefault(key, [0.0] * 3)[axis] = math.degrees(sigma) if key.endswith("_deg") else sigma
+    said |= {key: each if world == "space" and len({*each}) > 1 else each[0] for key, each in by_key.items()}
+    exact = {"state": at[pose:].tolist()} if at[pose:].any() and not names else {}
+    if not np.array_equal(pose_of(said), at[:pose]):
+        exact["quaternion"] = at[3:7].tolist()
+    found = covariance_of(said, len(P), behind)
+    if cov is not None and (found is None or not np.array_equal(found, P)):
+        exact["cov"] = P.tolist()
+    return said | exact
+
+
+def state_of(said: Mapping[str, Any], behind: tuple[str, ...]) -> list[float]:
+    """Return what a start says of a state behind its pose; empty if it says nothing."""
+    names = known(behind, world_of(said))
+    return [said[name] for name in names] if said.get("state") is None else [*said["state"]]
+
+
+def covariance_of(said: Mapping[str, Any], dof: int, behind: tuple[str, ...] = ()) -> Array | None:
+    """Return the covariance (dof, dof) of a mount or a start, None if it is known exactly.
+
+    `behind` are the names of what the state has behind its pose.
+    """
+    if said.get("cov") is not None:
+        return np.array(said["cov"], dtype=np.float64)
+    world, sigmas = world_of(said), np.zeros(dof)
+    for k, (key, axis) in enumerate([*SIGMAS[world], *map(sigma_of, known(behind, world))][:dof]):
+        sigma = np.broadcast_to(np.asarray(said[key], dtype=np.float64), 3)[axis]
+        sigmas[k] = np.radians(sigma) if key.endswith("_deg") else sigma
+    return np.diag(np.square(sigmas)) if sigmas.any() else None
+
+
+def sigma_of(name: str) -> tuple[str, int]:
+    """Return the key of a start with the sigma of what a state has behind its pose, and its axis, 0 of no axis."""
+    found = _AXIS.search(name)
+    return f"sigma_{_AXIS.sub('', name, count=1)}", "xyz".index(found[0][-1]) if found else 0
+
+
+def known(behind: tuple[str, ...], world: str) -> tuple[str, ...]:
+    """Return the names of a state behind its pose, if a start has keys for all of them."""
+    return behind if {*behind} <= {*STATES[world]} else ()

@@ -1,0 +1,232 @@
+"""Every declared option goes from Python to a run's configuration and a saved map, and back, to the last bit.
+
+The options are those that are declared: fields of `Robot`, `Mount` and `Settings`, parameters of registered models.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.cli import main
+from kalmark.config import load_config, slam_described
+from kalmark.config.schema import Config, MapConfig, PlaneMounted, RobotConfig
+from kalmark.config.sections import Choice, model_of, section_of
+from kalmark.declare import Parameter, built_in, class_of, parameters, registered_name, world_of_class
+from kalmark.errors import ConfigError, KalmarkError, ModelError
+from kalmark.geometry.rotations import from_euler
+from kalmark.models.landmark_views import Raised
+from kalmark.results.filter_description import configuration
+from kalmark.results.recording import config_yaml
+from kalmark.slam.description import OF_PLACE, describe, model
+from kalmark.slam.state import Settings
+
+ROLES = (
+    *("motion", "sensor", "landmark", "association", "estimator"),
+    *("detector", "initialization", "attention", "upkeep"),
+)
+MODELS = [(role, each) for role in ROLES for each in built_in(role)]
+SECTIONS: dict[Any, dict[str, Any]] = {
+    km.Robot: RobotConfig.model_fields,
+    km.Mount: PlaneMounted.model_fields | section_of("sensor", "range_bearing", "plane").model_fields,
+    Settings: Config.model_fields | MapConfig.model_fields | {"map": MapConfig.model_fields["type"]},
+}
+OPTIONS = [(kind, field.name) for kind in SECTIONS for field in fields(kind) if field.name not in OF_PLACE]
+SENSORS = (km.sensors.RangeBearing(), km.sensors.Bearing(), km.sensors.Range())
+PLACES = np.array([(1.0, -2.0), (4.0, -1.0), (3.0, 1.0)])  # by increasing bearing
+AT_3D = (0.1, -0.2, 0.3, *from_euler(np.array([0.3, -0.4, 2.0]))[0])
+
+
+def values(own: Parameter) -> Iterator[Any]:
+    """Yield values that a parameter may have and that are not its default."""
+    numbers = (0.25, 0.75, 1.5, 3.0, 7.0, 20.0) if own.type is float else (1, 2, 3, 5, 9)
+    one = own.default if isinstance(own.default, tuple) else ()
+    several = [tuple(v + step for v in one) for step in (1, 0.125)] + [(0.125, 0.25), (0.125,) * 4]
+    for value in (None, *own.words, False, True, *numbers, *several):
+        if value != own.default and type(value) is not type(own.default is None) and not own.refused(value):
+            yield value
+    if own.type is bool:
+        yield not own.default
+
+
+def changed(kind: Any, name: str) -> Any:
+    """Return a model with another value of a parameter than its default; where it needs one, of another one, too."""
+    declared = {own.name: own for own in parameters(kind)}
+    others = [()] + [((own.name, value),) for own in declared.values() if own.name != name for value in values(own)]
+    for value, more in itertools.product(values(declared[name]), others):
+        try:
+            return kind(**{name: value}, **dict(more))
+        except ModelError:
+            continue
+    raise AssertionError(f"{kind.__name__}: no other value of {name} is taken")
+
+
+def candidates(annotation: Any) -> Iterator[Any]:
+    """Yield what a key of a configuration may be: its words, its models, some numbers."""
+    for part in (annotation, *get_args(annotation)):
+        if get_origin(part) is Literal:
+            yield from get_args(part)
+        elif isinstance(part, Choice):
+            kinds = [class_of(part.role, name, "plane") for name in part.names()]
+            yield from (changed(kind, own.name) for kind in kinds for own in parameters(kind)[:1])
+        elif part is not annotation:
+            yield from candidates(part)
+    yield from (2, 1.5)
+
+
+def built(kind: Any, given: dict[str, Any]) -> km.Slam:
+    """Return a Slam of one robot with one sensor, which has these options of the robot, the mount or the Slam."""
+    options = {each: given if each is kind else {} for each in SECTIONS}
+    for sensor in SENSORS:
+        try:
+            mount = km.Mount(sensor, **options[km.Mount])
+            return km.Slam(
+                [km.Robot("r", km.motion.Unicycle(), None, {"s": mount}, **options[km.Robot])], **options[Settings]
+            )
+        except ModelError as error:
+            failed = error
+    raise failed
+
+
+def with_option(kind: Any, name: str) -> tuple[km.Slam, Any]:
+    """Return a Slam with another value of an option than its default, and this value."""
+    field, section = next(each for each in fields(kind) if each.name == name), SECTIONS[kind][name]
+    for value in itertools.chain(*map(candidates, (*section.metadata, section.annotation))):
+        if value != field.default:
+            try:
+                return built(kind, {name: value}), value
+            except (KalmarkError, TypeError):
+                continue
+    raise AssertionError(f"{kind.__name__}: no other value of {name} is taken")
+
+
+def assert_same(one: km.Slam, other: km.Slam) -> None:
+    """Assert that two filters are constructed alike, to the last bit."""
+    assert describe(one) == describe(other)
+    for name in (each.name for each in fields(Settings)):
+        assert vars(one.state.settings)[name] == vars(other.state.settings)[name], name
+    for a, b in zip(one.robots.values(), other.robots.values(), strict=True):
+        pairs = [(a, b), *((a.sensors[key], b.sensors[key]) for key in a.sensors)]
+        for x, y in pairs:
+            for field in (each.name for each in fields(x) if each.name != "sensors"):
+                mine, again = vars(x)[field], vars(y)[field]
+                is_array = isinstance(mine, np.ndarray | list)
+                assert np.array_equal(mine, again) if is_array else mine == again, (a.name, field)
+
+
+def read_again(slam: km.Slam, folder: Path) -> list[km.Slam]:
+    """Return the filters that the configuration of a run and the saved map of a filter make."""
+    log = km.log_from(controls={"t_s": [0.0], "robot": ["r"], "v_mps": [0.0], "w_radps": [0.0]})
+    (folder / "config.yaml").write_text(config_yaml(configuration(slam, log)))
+    slam.save(folder / "map.kmk")
+    return [km.Slam.from_config(folder / "config.yaml"), km.Slam.load(folder / "map.kmk")]
+
+
+@pytest.mark.parametrize(("role", "kind"), MODELS, ids=[f"{role}-{kind.__name__}" for role, kind in MODELS])
+def test_every_parameter_of_every_model_is_read_again(role: str, kind: Any) -> None:
+    world = world_of_class(kind) or "plane"
+    for own in parameters(kind):
+        made = changed(kind, own.name)
+        said = model(made)
+        if isinstance(made, Raised) and said.pop("height_m"):  # it is `mount.z_m`
+            continue
+        section = Choice(role, world_of_class(kind), typed=registered_name(kind) != role).validated(said)
+        assert model_of(section, world) == made, own.name
+
+
+@pytest.mark.parametrize(("kind", "name"), OPTIONS, ids=[f"{kind.__name__}-{name}" for kind, name in OPTIONS])
+def test_every_option_is_read_again_from_a_configuration_and_from_a_map(kind: Any, name: str, tmp_path: Path) -> None:
+    slam, _ = with_option(kind, name)
+    for again in read_again(slam, tmp_path):
+        assert_same(again, slam)
+
+
+def random_covariance(size: int) -> np.ndarray:
+    A = 0.1 * np.random.default_rng(size).normal(size=(size, size))
+    return A @ A.T
+
+
+def test_poses_states_and_covariances_are_read_again_to_the_last_bit(tmp_path: Path) -> None:
+    eye = km.Mount(km.sensors.Range(height_m=0.7), at=(0.1, 0.2, 0.3), cov=random_covariance(3))
+    moving = km.motion.ConstantVelocity3D()
+    start = (*AT_3D, *np.arange(1, moving.space.size - 6) / 7)
+    camera = km.Mount(km.sensors.TagPose(), at=AT_3D, cov=random_covariance(6))
+    slams = [
+        km.Slam([km.Robot("r", km.motion.Unicycle(), (1, 2, 0.1), {"s": eye}, random_covariance(3))]),
+        km.Slam([km.Robot("r", km.motion.Unicycle(), cov=np.diag([0.01, 0.02, 0.03]))]),
+        km.Slam([km.Robot("r", moving, start, {"s": camera}, random_covariance(moving.space.dof))]),
+        km.Slam([km.Robot("r", moving, start, {"s": replace(camera, cov=np.zeros((6, 6)))})]),
+    ]
+    for slam in slams:
+        for again in read_again(slam, tmp_path):
+            assert_same(again, slam)
+
+
+def test_a_readable_key_that_does_not_fit_the_exact_one_is_refused(tmp_path: Path) -> None:
+    slam = km.Slam([km.Robot("r", km.motion.Odometry3D(), AT_3D, cov=random_covariance(6))])
+    read_again(slam, tmp_path)
+    path = tmp_path / "config.yaml"
+    text = path.read_text().replace("x_m: 0.1", "x_m: 0.5")
+    path.write_text(text)
+    assert km.Slam.from_config(path).mean("r")[0] == 0.5
+    for key, what in (("yaw_deg", "quaternion"), ("sigma_position_m", "cov")):
+        with pytest.raises(ConfigError, match=rf"robots.r.start.{key}: got 7.0, expected .* {what}.* says, or none"):
+            slam_described(load_config(path, [f"robots.r.start.{key}=7.0"]).model_dump(exclude_unset=True))
+
+
+def write_log(folder: Path, robots: dict[str, list[str]], columns: dict[str, tuple[str, ...]]) -> None:
+    """Write what robots measure of three landmarks on an arc, at rest at first."""
+    sensed = sorted({column for each in columns.values() for column in each})
+    controls, scans = ["t_s,robot,v_mps,w_radps"], [",".join(("t_s,robot,sensor,id", *sensed))]
+    for k, (name, sensors) in itertools.product(range(12), robots.items()):
+        t = 0.2 * k
+        controls.append(f"{t:.1f},{name},{0.5 if k > 1 else 0.0},0.1")
+        for sensor, (i, p) in itertools.product(sensors, enumerate(PLACES - (0.1 * max(k - 2, 0), 0.0))):
+            y = {"range_m": np.hypot(*p), "bearing_rad": np.arctan2(p[1], p[0])}
+            cells = [f"{y[c]:.4f}" if c in columns[sensor] else "" for c in sensed]
+            scans.append(",".join((f"{t:.1f},{name},{sensor},{i}", *cells)))
+    folder.mkdir()
+    for table, rows in (("controls", controls), ("scans", scans)):
+        (folder / f"{table}.csv").write_text("\n".join(rows) + "\n")
+
+
+def test_a_run_with_every_option_is_the_same_map_by_the_command_line_and_after_loading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {(kind, name): with_option(kind, name) for kind, name in OPTIONS}
+    settings = {name: value for (kind, name), (_, value) in found.items() if kind is Settings}
+    mounts = {name: slam.robots["r"].sensors["s"] for (kind, name), (slam, _) in found.items() if kind is km.Mount}
+    place = {"start": (0.01, 0.02, 0.03), "cov": random_covariance(3)}
+    point, mounted = km.landmarks.Point2D(), {"at": (0.1, 0.2, 0.1), "cov": random_covariance(3)}
+    eyes = {name: replace(each, landmark=each.landmark or point, **mounted) for name, each in mounts.items()}
+    eyes["landmarks"] = found[Settings, "landmarks"][0].robots["r"].sensors["s"]
+    robots = [km.Robot("carrier", km.motion.Unicycle(), sensors=eyes, **place)]
+    for (kind, name), (slam, _) in found.items():
+        if kind is km.Robot:
+            robots.append(
+                replace(slam.robots["r"], name=name, sensors={"s": km.Mount(SENSORS[0], landmark=point)}, **place)
+            )
+    slam = km.Slam(robots, **settings)
+    carried = {robot.name: [*robot.sensors] for robot in robots}
+    columns = {key: tuple(each.sensor.columns) for robot in robots for key, each in robot.sensors.items()}
+    write_log(tmp_path / "log", carried, columns)
+    recorded = km.record(slam, km.open_log(tmp_path / "log"), progress=False)
+    assert len(slam.landmarks()) >= 3
+    recorded.save(tmp_path / "run")
+    monkeypatch.setattr("kalmark.compiled.say_compiling", lambda: None)
+    assert main(["run", str(tmp_path / "run" / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
+    names = (*slam.robots, *slam.landmarks().ids)
+    for folder in ("run", "again"):
+        other = km.Slam.load(tmp_path / folder / "map.kmk")
+        assert_same(other, slam)
+        assert other.landmarks().ids == slam.landmarks().ids
+        np.testing.assert_array_equal(other.covariance(*names), slam.covariance(*names), folder)
+        for name in names:
+            np.testing.assert_array_equal(other.mean(name), slam.mean(name), folder)
