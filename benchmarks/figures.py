@@ -460,6 +460,10 @@ def diagnosis() -> Iterator[Figure]:
                  "85 %, 97 %", command, read)  # fmt: skip
     yield Figure(section, "clean simulated logs that are accused of anything (200)", "1 % at most", command,
                  row("clean:", "{0} of {2}"))  # fmt: skip
+    names = "right and ok / right, doubtful or unchecked / right and wrong / wrong and named / wrong and ok"
+    rows = ["right and ok", "right and doubtful or unchecked", "right and wrong", "wrong and named", "wrong and ok"]
+    yield Figure(section, f"200 logs of ten worlds from outside, 23 faults, without truth: {names}", "at most 2 wrong and ok",
+                 "python benchmarks/verdict_truth.py LOGS", several(rows))  # fmt: skip
     for world in ("lever_arm", "wheels_and_gyro", "compass_and_gyro", "stop_and_go"):
         yield Figure(section, f"faults of sensors of the state, `{world}`: alarmed / named, of planted; good runs accused", "",
                      f"python benchmarks/diagnosis_readings.py {world} --seeds 2 --clean 10",
