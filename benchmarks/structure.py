@@ -171,9 +171,7 @@ def of_node(node: ast.AST) -> Iterator[str]:
 
 
 def of_module(tree: ast.Module) -> Iterator[str]:
-    """Yield the names of the counts that a module belongs to, once for each of its named numbers and texts."""
-    if (ast.get_docstring(tree) or "").lower().startswith(QUESTIONS):
-        yield "modules that begin with a question word"
+    """Yield the name of the count of named numbers and texts, once for each of a module."""
     for x in tree.body:
         targets = x.targets if isinstance(x, ast.Assign) else [x.target] if isinstance(x, ast.AnnAssign) else []
         if isinstance(getattr(x, "value", None), ast.Constant | ast.UnaryOp | ast.BinOp):
@@ -189,6 +187,8 @@ def counts() -> dict[str, int]:
     stems = Counter(file.stem for file in files if file.stem != "__init__")
     found = Counter(name for node in nodes for name in of_node(node))
     found.update(name for tree in trees for name in of_module(tree))
+    heads = [(ast.get_docstring(tree) or "").lower() for tree in trees]
+    found["modules that begin with a question word"] = sum(head.startswith(QUESTIONS) for head in heads)
     found["file names used more than once"] = sum(n for n in stems.values() if n > 1)
     found[f"public names of {OFTEN} functions or more"] = sum(n >= OFTEN for n in Counter(public).values())
     found["modules in the largest import cycle"] = largest_cycle(imports(modules()))
