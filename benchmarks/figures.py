@@ -379,7 +379,7 @@ def unknown_ids() -> Iterator[Figure]:
         yield Figure(section, f"MRCLAM 6, robot {robot}: of these, of landmarks over .5 m apart", "", each,
                      row("of these, of landmarks more than 0.5 m apart:", "{0}"))  # fmt: skip
         yield Figure(section, f"MRCLAM 6, robot {robot}: aligned path RMSE / with ids", "1.3 times", each,
-                     row(f"{robot}: aligned path RMSE", "{0} m / {4} m"))  # fmt: skip
+                     row(f"robot{robot}: aligned path RMSE", "{0} m / {4} m"))  # fmt: skip
         ideal = f'python benchmarks/unknown_ids.py mrclam --set "log.robots=[{robot}]"'
         yield Figure(section, f"MRCLAM 6, robot {robot}, all earlier ids known: another landmark is the nearest / takes the best assignment",
                      "", ideal, row("another is the nearest:", "{0} / {9}"))  # fmt: skip

@@ -180,7 +180,7 @@ def of_module(tree: ast.Module) -> Iterator[str]:
 
 def counts() -> dict[str, int]:
     """Return the counts by their names."""
-    files = [file for file in modules().values()]
+    files = [*modules().values()]
     trees = [ast.parse(file.read_text()) for file in files]
     nodes = [node for tree in trees for node in ast.walk(tree)]
     public = [node.name for node in nodes if isinstance(node, Function) and not node.name.startswith("_")]

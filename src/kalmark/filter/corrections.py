@@ -71,7 +71,7 @@ from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
 Routines = tuple[int, int, int, int, int, int, int, int]  # addresses, see `routines`
 Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
-Sizes = tuple[int, int, int, int, int, int]  # see `observed`
+Sizes = tuple[int, int, int, int, int, int]  # see `observed_block`
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")

@@ -8,7 +8,7 @@ landmark is removed       -> State.remove reduction           [S] Table 1
 `association` decides which landmark was observed, `management` what becomes of landmarks: both read a `ScanContext` and
 return decisions and actions.  The modules of this package apply them, each one stage of the loop: they alone change a
 `State`.  `locating` finds a robot that may be anywhere, `tentative` holds back what may be no landmark, `maintenance`
-and `merging` follow the corrections, `own_readings` are corrections by what is measured of the robot alone.
+and `merging` follow the corrections, `state_corrections` are corrections by what is measured of the robot alone.
 """
 
 from __future__ import annotations
