@@ -417,7 +417,7 @@ def storms() -> Iterator[Figure]:
                      f"python benchmarks/fuzz.py --seconds 600{limit} {name}", row("total", "{0} / {2}"))  # fmt: skip
     for kind in ("dense", "postponed"):
         yield Figure("Bad events", f"A scan of 3,000 landmarks, `{kind}` map: all new / known by their ids / memory", "seconds / seconds / -",
-                     f"python benchmarks/large_scan.py --map {kind}", row("3000 landmarks:", "{0} s / {2} s / {4} MB"))  # fmt: skip
+                     f"python benchmarks/large_scan.py --map {kind}", row("3000 landmarks:", "{0} s / {3} s / {6} MB"))  # fmt: skip
     yield Figure("Bad events", "A log of 1,000,000 rows of CSV: time / memory / bytes a row", "- / that of its events / -",
                  "python benchmarks/tables.py --rows 1000000", row("1000000 rows,", "{6} s / {8} MB / {10}"))  # fmt: skip
     yield Figure("Bad events", "Of 10,000,000 rows, event by event (`stream_log`): time / growth of the memory", "- / bounded",
