@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.codec import Reader, Writer, kind_of
 from kalmark.errors import KalmarkError
 from kalmark.geometry.frames3d import from_euler_pose, to_frame_many
 from kalmark.vision.beginning import LEAST_RHO, Beginning, Begun, residuals
@@ -82,7 +83,12 @@ def test_what_is_saved_of_first_frames_goes_on_as_it_was() -> None:
     for k, T in enumerate(poses):
         y = CAMERA.expect(to_frame_many(T, points)[0])[0]
         one.add(km.Scan(k / 30, "camera", "eye", y, [str(i) for i in range(50)]), ["a"] * (k == 3), {"4": y[4]}, T)
-    assert Beginning.restored(one.state()).state() == one.state()
+    writer = Writer({})
+    says = kind_of(Beginning).write(writer, one)
+    again = kind_of(Beginning).read(Reader(writer.numbers(), {}), says, None)
+    assert [(scan.t_ns, scan.ids, gone) for scan, gone in again.scans] == [(s.t_ns, s.ids, g) for s, g in one.scans]
+    np.testing.assert_array_equal(again.poses, one.poses)
+    assert [fitted["4"].tolist() for fitted in again.matched] == [fitted["4"].tolist() for fitted in one.matched]
 
 
 def test_anything_but_a_frame_ends_the_beginning() -> None:

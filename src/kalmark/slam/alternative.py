@@ -10,6 +10,7 @@ readings fit the map again.  If they fit the alternative for longer than receive
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.linalg import solve
@@ -37,6 +38,7 @@ class Alternative:
     moving: Moving
     since_ns: int
     misses: int = 0
+    SAVED: ClassVar = ("map", "since_ns", "misses")
 
     @classmethod
     def of(cls, map_: Map, moving: Moving, blocks: int, since_ns: int) -> Alternative:

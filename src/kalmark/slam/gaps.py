@@ -11,12 +11,11 @@ A control of a motion that the limits of the robot rule out is left out, as if i
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.errors import EventError
+from kalmark.errors import EventError, MapError
 from kalmark.events import Control, seconds
 from kalmark.models.protocols import Motion
 from kalmark.report import Gap
@@ -29,10 +28,6 @@ HELD_NS = 2_000_000_000  # a velocity or a steering angle may well be held so lo
 LEARNED = 20  # controls from one look at them to the next, and before the first
 MARGIN = 1.2  # greatest speed over the greatest one in the log so far
 NEVER_NS = 2**62
-KEPT = (
-    "last_ns", "since_ns", "until_ns", "left_out_ns", "usual_ns", "bound_ns", "intervals", "pending", "largest",
-    "adrift",
-)  # fmt: skip
 WHOLE = 1.5  # an increment at least so much larger than any before is of the whole gap: its odometry went on
 RULED_OUT = 1.5  # times the limits of the robot: no such motion, but a jump of its odometry
 
@@ -43,32 +38,33 @@ class Gaps:
     `max_speed_mps` and `max_turn_radps` are its limits; None: `MARGIN` times the largest so far.
     """
 
+    last_ns: int | None  # time of the last control
+    since_ns: int | None  # from when on the motion is unknown,
+    until_ns: int  # and up to when the pose has been widened for it
+    left_out_ns: int | None  # since when controls are left out
+    usual_ns: int
+    bound_ns: int | None  # what is later is a gap, None: not known yet
+    intervals: tuple[int, ...]
+    pending: tuple[tuple[int, Array], ...]
+    largest: Array  # of an increment: per second
+    adrift: bool  # whether the pose may be anywhere since a gap
+
     def __init__(
         self, robot: str, motion: Motion, action: str, max_speed_mps: float | None, max_turn_radps: float | None
     ) -> None:
         self.robot, self.motion, self.action = robot, motion, action
         self.max_speed_mps, self.max_turn_radps = max_speed_mps, max_turn_radps
         self.limited = action != "ignore" and (max_speed_mps, max_turn_radps) != (None, None)
-        self.last_ns: int | None = None  # time of the last control
+        self.last_ns = self.since_ns = self.left_out_ns = self.bound_ns = None
+        self.until_ns, self.usual_ns, self.intervals, self.pending, self.adrift = 0, 0, (), (), False
+        self.largest = np.zeros(len(motion.columns))
         self.late_ns = NEVER_NS  # after which the next is late
-        self.since_ns: int | None = None  # from when on the motion is unknown,
-        self.until_ns = 0  # and up to when the pose has been widened for it
-        self.usual_ns = 0
-        self.bound_ns: int | None = None  # what is later is a gap, None: not known yet
-        self.intervals: tuple[int, ...] = ()
-        self.pending: tuple[tuple[int, Array], ...] = ()
-        self.largest: Array = np.zeros(len(motion.columns))  # of an increment: per second
-        self.adrift = False  # whether the pose may be anywhere since a gap
-        self.left_out_ns: int | None = None  # since when controls are left out
         self.noticed: Gap | None = None
 
-    def state(self) -> dict[str, Any]:
-        """Return what events have made of it."""
-        return {name: vars(self)[name] for name in KEPT}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take back what `state` gave."""
-        vars(self).update(state)
+    def restored(self) -> None:
+        """Expect the next control by what a file has.  Raises MapError for controls of another length."""
+        if {len(u) for u in (self.largest, *(u for _, u in self.pending))} != {len(self.motion.columns)}:
+            raise MapError(f"controls of {self.robot!r} are no arrays of {len(self.motion.columns)} numbers")
         self._expect_next()
         if self.since_ns is not None:
             self.late_ns = min(self.late_ns, self.since_ns)

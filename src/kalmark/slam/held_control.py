@@ -15,12 +15,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.errors import EventError
+from kalmark.errors import EventError, MapError
 from kalmark.events import Control
 from kalmark.filter.estimators import Movement
 from kalmark.filter.kernels import moved_noise
@@ -95,17 +95,28 @@ class HeldInput:
     that stop.  Controls up to `rests_until_ns` are those of a robot that stands: its start was found from them.
     """
 
+    t_ns: int | None
+    u: Array | None
+    N: Array | None
+    usual: Array | None  # as earlier controls tell it,
+    mean: Mean | None  # which is their mean
+    fresh: bool
+    gaps: Gaps | None
+
     def __init__(self, motion: Motion, gaps: Gaps | None = None, rests_until_ns: int | None = None) -> None:
         self.motion, self.coasts, self.calibrates = motion, coasts(motion), calibrating(motion) is not None
-        self.t_ns: int | None = None
-        self.u: Array | None = None
-        self.N: Array | None = None
-        self.usual: Array | None = None  # as earlier controls tell it,
-        self.mean: Mean | None = None  # which is their mean
-        self.fresh = True
-        self.gaps = None if self.coasts else gaps
+        self.t_ns = self.u = self.N = self.usual = self.mean = None
+        self.fresh, self.gaps = True, None if self.coasts else gaps
         self.rests_until_ns = -math.inf if rests_until_ns is None else rests_until_ns
         self._before: tuple[Any, ...] = ()
+
+    def restored(self) -> None:
+        """Check the arrays of a file.  Raises MapError."""
+        k = len(self.motion.columns)
+        rate = None if self.mean is None else self.mean.rate
+        for array, shape in ((self.u, (k,)), (self.N, (k, k)), (self.usual, (k,)), (rate, (k,))):
+            if array is not None and array.shape != shape:
+                raise MapError(f"a control has an array {array.shape}, expected {shape}")
 
     def __enter__(self) -> Self:
         watched = None if self.gaps is None else vars(self.gaps).copy()
@@ -241,6 +252,7 @@ class Moving:
     held: HeldInput
     error: int | None = None
     left_out: list[LeftOut] = field(default_factory=list)
+    SAVED: ClassVar = ("slot", "bias", "held", "error", "left_out")
 
     @cached_property
     def moves_itself(self) -> bool:

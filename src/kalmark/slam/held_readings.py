@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -101,16 +100,3 @@ class Given:
             self.differ, self.equal = self.differ + new.sum(axis=0), self.equal + (~new).sum(axis=0)
         self.y, self.ids, self.went, self.doubt = y, ids, np.zeros(0), np.zeros(0)
         return False
-
-    def saved(self) -> list[Any]:
-        """Return all of it as lists and numbers."""
-        return [value.tolist() if isinstance(value, np.ndarray) else value for value in vars(self).values()]
-
-    @classmethod
-    def restored(cls, y: list[Any], ids: Sequence[Id | None] | None, *rest: Any) -> Given:
-        """Return what was `saved`."""
-        least, logs, differ, equal, went, doubt = (np.array(a, dtype=np.float64) for a in rest[:6])
-        repeats, number, since_ns = map(int, rest[6:])
-        shaped = np.array(y, dtype=np.float64).reshape(-1, len(least))
-        ids = None if ids is None else tuple(ids)
-        return cls(shaped, ids, least, logs, differ, equal, went, doubt, repeats, number, since_ns)

@@ -44,6 +44,12 @@ class Reader:
     `is_position`: as a fix it says where a lost robot is.
     """
 
+    t_ns: int | None  # of its last reading
+    standing: Standing | None
+    mean: Mean | None  # of its readings, where its scale is estimated of what the robot's controls say,
+    sigma: Array  # and what the last was uncertain by, as a rate
+    until: dict[int, int] | None  # of a scan that readings of a log count from, the time of the last
+
     def __init__(
         self, sensor: OfState, motion: Motion, at: Array, mount: int, standing: Standing | None = None
     ) -> None:  # fmt: skip
@@ -53,18 +59,15 @@ class Reader:
         self.of_state = sees_state(sensor, motion)
         self.counts = sensor.views != POSE and not self.of_state
         self.keep = protocols.poses_kept(sensor)
-        self.until: dict[int, int] | None = None  # of a scan that readings of a log count from, the time of the last
+        self.t_ns = self.mean = self.until = None
         self.is_position = tuple(sensor.columns) in POSITIONS
         scales = protocols.parameter_covariance(sensor) is not None and "gain" in protocols.parameter_names(sensor)
-        self.scales = self.counts and scales  # its scale is estimated of what the robot's controls say
-        self.mean: Mean | None = None  # of its readings, where it does,
-        self.sigma: Array = np.zeros(len(sensor.columns))  # and what the last was uncertain by, as a rate
+        self.scales, self.sigma = self.counts and scales, np.zeros(len(sensor.columns))
         if self.of_state and not np.diagonal(sensor.noise(np.zeros((1, len(sensor.columns))))[0]).all():
             name, wanted = type(sensor).__name__, "a positive number for each component"
             raise ModelError(f"{name}: the noise of one reading is 0, expected {wanted}: the state has the velocity")
         self.check = sensor.check if isinstance(sensor, protocols.Checked) else None
         self.gate = gate(self.sensor.pass_share, protocols.innovation_size(sensor))
-        self.t_ns: int | None = None  # of its last reading
         self._view: Any = None
 
     @property
@@ -176,16 +179,3 @@ class Reader:
             return estimator.for_fixes()
         many = is_loop and not self.scales
         return estimator.once() if isinstance(estimator, Iterating) and not many else estimator
-
-    def saved(self) -> list[Any]:
-        """Return the mean of its readings and what it foresees as they are saved, None where there is none."""
-        mean = None if self.mean is None else [self.mean.rate.tolist(), self.mean.number, self.sigma.tolist()]
-        return [mean, None if self.until is None else [*self.until.items()]]
-
-    def restore(self, mean: list[Any] | None = None, until: list[list[int]] | None = None) -> None:
-        """Take back what was saved."""
-        if mean is not None:
-            (rate, number, sigma), size = mean, (len(self.sensor.columns),)
-            self.mean = Mean(np.array(rate, dtype=np.float64).reshape(size), max(int(number), 1))
-            self.sigma = np.array(sigma, dtype=np.float64).reshape(size)
-        self.until = None if until is None else {int(from_ns): int(t_ns) for from_ns, t_ns in until}

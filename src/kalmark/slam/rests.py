@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -69,6 +69,7 @@ class Source:
     per_s: bool
     t_ns: int | None = None
     readings: list[tuple[Array, Array]] = field(default_factory=list)
+    SAVED: ClassVar = ("t_ns", "readings")
 
     def take(self, t_ns: int, y: Array, R: Array | None) -> None:
         """Keep a control or reading y (m,) with the noise R (m, m), None for that of the sensor."""
@@ -123,6 +124,9 @@ def standing_of(sensor: Any, robot: Robot) -> Standing | None:
 class Standing:
     """Notices that a robot stands, window by window; `sensor` says how sure that must be."""
 
+    began_ns: int | None
+    sources: dict[str, Source]
+
     def __init__(self, sensor: Any, robot: Robot) -> None:
         self.sensor, self.robot, self.motion = sensor, robot.name, robot.motion
         self.sources = {source.name: source for source in sources_of(robot)}
@@ -132,7 +136,7 @@ class Standing:
                 f"robot {robot.name!r}: nothing tells a {type(sensor).__name__} speed and turn rate, expected controls "
                 "or sensors, such as speed and gyro, that do"
             )
-        self.began_ns: int | None = None
+        self.began_ns = None
         normal = NormalDist()
         self._sure = normal.inv_cdf(1.0 - sensor.false_alarm)
         self._many = normal.inv_cdf(0.5 * (1.0 + sensor.pass_share))
@@ -159,22 +163,6 @@ class Standing:
         for each in self.sources.values():
             each.readings = []
         return stood
-
-    def state(self) -> list[Any]:
-        """Return the window for a file."""
-        kept = [
-            [source.name, source.t_ns, [[z.tolist(), s2.tolist()] for z, s2 in source.readings]]
-            for source in self.sources.values()
-        ]
-        return [self.began_ns, kept]
-
-    def restore(self, state: Any) -> None:
-        """Take over the window of a file."""
-        self.began_ns, kept = None if state[0] is None else int(state[0]), state[1]
-        for name, t_ns, readings in kept:
-            source = self.sources[name]
-            source.t_ns = None if t_ns is None else int(t_ns)
-            source.readings = [(np.array(z, dtype=np.float64), np.array(s2, dtype=np.float64)) for z, s2 in readings]
 
     def stood(self, constants: Constants) -> bool:
         """Return whether the robot stood in this window; a source that was silent does not say so."""

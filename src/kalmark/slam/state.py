@@ -61,21 +61,27 @@ class State:
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
+    t_ns: int | None
+    taken: set[tuple[str, str, str]]
+    map: Map
+    tracks: Tracks
+    clones: Clones
+    surveys: Surveys
+    given: dict[ChannelKey, Given]
+    placed: int  # fixes that have told where the map is in the world; a survey counts as many
+    moving: dict[str, Moving]
+    alternatives: dict[str, Alternative]
+    sums: dict[str, GaussianSum]
+    front_ends: dict[ChannelKey, FrontEnd]
+    readers: dict[ChannelKey, Reader]
+
     def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
-        self.settings, self.robots = settings, robots
-        self.t_ns: int | None = None
-        self.taken: set[tuple[str, str, str]] = set()
-        self.map: Map = new_map(settings.map, settings.numbers)
-        self.tracks, self.clones, self.surveys = Tracks(robots), Clones(), Surveys()
-        self.given: dict[ChannelKey, Given] = {}
-        self.placed = 0  # fixes that have told where the map is in the world; a survey counts as many
-        self.alternatives: dict[str, Alternative] = {}
-        self.sums: dict[str, GaussianSum] = {}
-        self.moving: dict[str, Moving] = {}
+        self.settings, self.robots, self.t_ns, self.taken, self.placed = settings, robots, None, set(), 0
+        self.map, self.tracks = new_map(settings.map, settings.numbers), Tracks(robots)
+        self.clones, self.surveys, self.given, self.alternatives, self.sums = Clones(), Surveys(), {}, {}, {}
+        self.moving, self.front_ends, self.readers = {}, {}, {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
-        self.front_ends: dict[ChannelKey, FrontEnd] = {}
-        self.readers: dict[ChannelKey, Reader] = {}
         self.standing: dict[str, str] = {}
         self.inner = {bias_name(name) for name in robots}
         self.inner |= {mount_name(name, key) for name, robot in robots.items() for key in robot.sensors}

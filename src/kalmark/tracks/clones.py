@@ -52,10 +52,12 @@ class Clones:
     `latest` are the numbers of clones of where robots are, which have not moved since.
     """
 
+    clones: dict[int, Clone]
+    latest: dict[str, int]
+    numbered: int
+
     def __init__(self) -> None:
-        self.clones: dict[int, Clone] = {}
-        self.latest: dict[str, int] = {}
-        self.numbered = 0
+        self.clones, self.latest, self.numbered = {}, {}, 0
 
     def __getitem__(self, number: int) -> int:
         """Return the slot of a clone."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
+from collections.abc import Set
 from typing import Any, Protocol, runtime_checkable
 
 from kalmark.arrays import Array
@@ -77,18 +77,6 @@ class FrontEnd(Protocol):
 
     def moved(self, poses: list[Array], names: Set[Id]) -> None:
         """Learn that the sensor was at other poses (7,) in the frames so far, and that only `names` are landmarks."""
-        ...
-
-    def state(self) -> dict[str, Any]:
-        """Return what is to be saved with the map, in words of JSON."""
-        ...
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the arrays that are to be saved with the map."""
-        ...
-
-    def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
-        """Take over what was saved; `read` gives an array by its name and shape."""
         ...
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.arrays import Array, Index
+from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.nearest_blocks import has_place
 from kalmark.geometry.density import NEIGHBOURS, log_density
@@ -25,9 +26,21 @@ FEWEST = 16  # rows of a new array
 class Known:
     """The landmarks of one kind: `names` in order, their `values` (N, n), and how often each was used."""
 
+    model: Landmark
+    names: list[Id]
+    _l: Array
+    _counts: Index
+
     def __init__(self, model: Landmark) -> None:
-        self.model, self.names = model, list[Id]()
+        self.model, self.names = model, []
         self._l, self._counts = np.zeros((FEWEST, model.space.size)), np.zeros(FEWEST, dtype=np.int64)
+        self._forget()
+
+    def restored(self) -> None:
+        """Check the arrays of a file.  Raises MapError."""
+        rows = len(self._counts)
+        if rows < max(len(self.names), 1) or self._l.shape != (rows, self.model.space.size):
+            raise MapError(f"the values of {len(self.names)} known landmarks are {self._l.shape}")
         self._forget()
 
     def _forget(self) -> None:
@@ -131,10 +144,18 @@ class Known:
 class KnownLandmarks:
     """All landmarks known exactly, by name; `changes` counts those that have come or gone."""
 
+    of_kind: dict[str, Known]
+    changes: int
+
     def __init__(self) -> None:
-        self.of_kind: dict[str, Known] = {}
-        self.changes = 0
-        self._at: dict[Id, tuple[str, int]] = {}
+        self.of_kind, self.changes = {}, 0
+        self.restored()
+
+    def restored(self) -> None:
+        """Find the rows of all names.  Raises MapError where one is there twice."""
+        self._at = {name: (kind, row) for kind, of in self.of_kind.items() for row, name in enumerate(of.names)}
+        if len(self._at) < sum(len(of.names) for of in self.of_kind.values()):
+            raise MapError("a landmark known exactly is there twice, expected each name once")
 
     def __len__(self) -> int:
         return len(self._at)
@@ -188,11 +209,6 @@ class KnownLandmarks:
             if fused:
                 kind, row = self._at[name]
                 self.of_kind[kind].counts[row] += 1
-
-    def recount(self, name: Id, observations: int) -> None:
-        """Set how many observations of a landmark were used."""
-        kind, row = self._at[name]
-        self.of_kind[kind].counts[row] = observations
 
     def extent(self, name: Id) -> Array | None:
         """Return the abscissas (2,) of the ends of a line, None of what is no line."""

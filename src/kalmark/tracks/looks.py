@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Self
 
 import numpy as np
 
@@ -82,18 +81,9 @@ class Looks:
         np.add.at(self.counts[1], cells.ravel(), 1.0)
         np.add.at(self.counts[0], cells[seen].ravel(), 1.0)
 
-    def saved(self) -> tuple[Any, ...]:
-        """Return the numbers for a file."""
-        return self.pose, self.scale_m, self.since, self.changes, self.taken, self.counts, self.table
-
-    @classmethod
-    def restored(cls, pose: Any, scale_m: float, since: int, changes: int, taken: int, *tables: Any) -> Self:
-        """Return what `saved` gave.  Raises MapError."""
-        at = None if pose is None else np.array(pose, dtype=np.float64)
-        counts, table = (np.array(each, dtype=np.float64) for each in tables)
-        if counts.shape != (2, CELLS) or table.shape != (CELLS,) or not (counts >= 0).all() or not (table >= 0).all():
-            raise MapError(f"the counts of looks are arrays {counts.shape} and {table.shape}, expected {(2, CELLS)}")
-        return cls(at, float(scale_m), int(since), int(changes), int(taken), counts, table)
+    def __post_init__(self) -> None:
+        if self.counts.shape != (2, CELLS) or self.table.shape != (CELLS,):
+            raise MapError(f"the counts of looks are {self.counts.shape} and {self.table.shape}, expected {(2, CELLS)}")
 
 
 def cells_of(r: Array, bearing: Array, hidden: Flags) -> Index:

@@ -23,10 +23,12 @@ class Surveys:
     the landmarks that did not fit since one did.
     """
 
+    trial: dict[Id, int]
+    misfits: dict[Id, tuple[int, frozenset[Id]]]
+    strangers: dict[str, set[Id]]
+
     def __init__(self) -> None:
-        self.trial: dict[Id, int] = {}
-        self.misfits: dict[Id, tuple[int, frozenset[Id]]] = {}
-        self.strangers: dict[str, set[Id]] = {}
+        self.trial, self.misfits, self.strangers = {}, {}, {}
 
     def forget(self, name: Id) -> None:
         """Forget a landmark."""

@@ -115,24 +115,31 @@ class Tracks:
     decide whether landmarks exist, with the Beta density `detection` of their detection probabilities.
     """
 
+    confirmed: dict[Id, Track]
+    tentative: dict[Id, Track]
+    pending: dict[Id, Track]
+    candidates: dict[ChannelKey, list[Pending]]
+    slots: dict[Id, int]
+    recent: list[Id]
+    last_scan: list[Id]
+    changes: int
+    searched: int
+    unnamed: int
+    reserved: set[Id]
+    experience: float
+    known: KnownLandmarks
+    looks: dict[ChannelKey, Looks]
+    looked: int
+    detection: tuple[float, float]
+
     def __init__(self, robots: Iterable[str]) -> None:
         self.robots = tuple(robots)
-        self.confirmed: dict[Id, Track] = {}
-        self.tentative: dict[Id, Track] = {}
-        self.pending: dict[Id, Track] = {}
-        self.candidates: dict[ChannelKey, list[Pending]] = {}
-        self.slots: dict[Id, int] = {}
+        self.confirmed, self.tentative, self.pending, self.candidates = {}, {}, {}, {}
+        self.slots, self.recent, self.last_scan, self.reserved = {}, [], [], set()
+        self.changes = self.searched = self.unnamed = self.looked = 0
+        self.experience, self.known, self.looks, self.detection = 0.0, KnownLandmarks(), {}, (0.5, 0.5)
         self.names: dict[int, Id] = {}
         self.sorts: dict[Id, str] = {}
-        self.recent: list[Id] = []
-        self.last_scan: list[Id] = []
-        self.changes = self.searched = 0
-        self.unnamed = 0
-        self.reserved: set[Id] = set()
-        self.experience = 0.0
-        self.known = KnownLandmarks()
-        self.looks: dict[ChannelKey, Looks] = {}
-        self.looked, self.detection = 0, (0.5, 0.5)
         self._sort_at: Index = np.full(64, -1)  # by slot: the number of a landmark's kind in `_numbers`, -1 for none
         self._numbers: dict[str, int] = {}
         self._wanted: dict[frozenset[str], Flags] = {}
@@ -156,6 +163,14 @@ class Tracks:
         """Return the slots (K,) of blocks that are in the map."""
         return np.fromiter(map(self.slots.__getitem__, names), np.int64, len(names))
 
+    def number(self) -> None:
+        """Compute what follows from the tracks and the slots of a file."""
+        self.names, self.sorts = {}, {name: ROBOT for name in self.robots}
+        changes = self.changes
+        for track in self.confirmed.values():
+            self.enter(track)
+        self.changes = changes
+
     # ------------------------------------------------------------------ landmarks
     def confirm(self, track: Track, observations: int = 1) -> None:
         """Make a landmark of the map of a track that has a block."""
@@ -169,8 +184,8 @@ class Tracks:
         name, slot, kind = track.id, track.slot, track.model.kind
         self.confirmed[name], self.slots[name], self.names[slot], self.sorts[name] = track, slot, name, kind
         self._reach(slot)
-        self.changes += 1
         self._sort_at[slot] = self._numbers.setdefault(kind, len(self._numbers))
+        self.changes += 1
 
     def replace(self, track: Track, slot: int, model: Landmark) -> None:
         """Give a landmark another block and another model."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from kalmark.arrays import Array, Index
 from kalmark.geometry.rotations import matrix
@@ -31,7 +32,7 @@ class View:
     `frame` is the number of the image.
     """
 
-    patch: Any
+    patch: npt.NDArray[np.uint8]
     T: Array
     rays: Array
     frame: int = 0

@@ -85,33 +85,6 @@ class Beginning:
         self.end()
         return begun
 
-    def state(self) -> dict[str, Any]:
-        """Return what is to be saved with the map, in words of JSON."""
-        frames = [
-            [
-                scan.t_ns,
-                scan.robot,
-                scan.sensor,
-                list(scan.ids or ()),
-                scan.y.tolist(),
-                removed,
-                list(fitted),
-                T.tolist(),
-            ]
-            for (scan, removed), fitted, T in zip(self.scans, self.matched, self.poses, strict=True)
-        ]
-        return {"next": self.next, "frames": frames}
-
-    @staticmethod
-    def restored(state: dict[str, Any]) -> Beginning:
-        """Return what was saved."""
-        beginning = Beginning(next=int(state["next"]))
-        for t_ns, robot, sensor, ids, y, removed, fitted, T in state["frames"]:
-            scan = Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=y, ids=ids or None)
-            at = dict(zip(ids, scan.y, strict=True))
-            beginning.add(scan, removed, {name: at[name] for name in fitted}, np.array(T, dtype=np.float64).reshape(7))
-        return beginning
-
     def end(self) -> None:
         """Keep no more frames."""
         self.over, self.scans, self.poses, self.matched = True, [], [], []

@@ -15,9 +15,10 @@ FORGIVEN = 15  # frames until a cell in which no corner was found is looked at a
 class Cells:
     """Cells of an image, `across` of its longer side, shifted anew each time; it remembers where nothing was found."""
 
+    failed: dict[tuple[int, int], int]
+
     def __init__(self, cv2: Any, across: int, half: int, contrast: float) -> None:
-        self.cv2, self.across, self.half, self.contrast = cv2, across, half, contrast
-        self.failed: dict[tuple[int, int], int] = {}
+        self.cv2, self.across, self.half, self.contrast, self.failed = cv2, across, half, contrast, {}
 
     def corners(
         self, image: Any, taken: Array, count: int, margin: int, frame: int, random: np.random.Generator

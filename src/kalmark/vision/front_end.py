@@ -8,7 +8,7 @@ ones from another side, and which landmarks are not worth their place any more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
+from collections.abc import Set
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -17,6 +17,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.declare import Count, Positive, Within, register
+from kalmark.errors import MapError
 from kalmark.events import Frame, Id, Scan
 from kalmark.filter.map import Map
 from kalmark.geometry.rotations import matrix
@@ -31,7 +32,7 @@ from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
 from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
-from kalmark.vision.planes import NUMBERS, Plane, measured, shown
+from kalmark.vision.planes import Plane, measured, shown
 from kalmark.vision.recognition import matched_again, recognised
 from kalmark.vision.searches import TRIAL, Searches
 from kalmark.vision.selection import Search, Selection
@@ -40,7 +41,6 @@ from kalmark.vision.template_matching import Searcher, shift_covariances
 
 FEW, ENOUGH = 4, 20  # matches, with fewer of which the sensor is lost; landmarks by which it may recognise the place
 EVERY, AWAY = 5, 30  # frames: how often it asks if a place is seen again; how long landmarks of it were not found
-OLDER = 8  # words about a landmark in a file without its misfit
 SHIFT_PX = 0.04  # sigma of the shift of a match that counts half: as much as a pixel of the sensor
 PATCH, TEMPLATE = 12, 6  # half widths of what is kept and of what is compared, px
 
@@ -97,6 +97,13 @@ class FrontEnd:
     """Searches the frames of one sensor; `looks` has how each landmark looked, `times` what the parts took, s."""
 
     waits: ClassVar[bool] = False
+    random: np.random.Generator
+    cells: Cells
+    looks: dict[Id, Look]
+    frame: int
+    named: int
+    beginning: Beginning | None
+    is_lost: bool
 
     def __init__(self, settings: ActiveSearch, sensor: Any) -> None:
         self.settings, self.sensor, self.cv2 = settings, sensor, opencv()
@@ -104,13 +111,10 @@ class FrontEnd:
         width = sensor.image[0]
         across = max(4, round(np.sqrt(1.6 * settings.in_view * width / sensor.image[1])))
         self.cells = Cells(self.cv2, across, TEMPLATE, settings.contrast)
-        self.looks: dict[Id, Look] = {}
-        self.frame = self.named = 0
+        self.looks, self.frame, self.named, self.beginning, self.is_lost = {}, 0, 0, None, False
         self.found: Selection | None = None
         self.prospect: Prospect | None = None
         self.image: Any = None
-        self.beginning: Beginning | None = None
-        self.is_lost = False
         self.sighting: Sighting | None = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
 
@@ -239,55 +243,13 @@ class FrontEnd:
         """Search, too, for a landmark known beforehand: its patch is taken where it is first seen."""
         self.looks[name] = Look(surveyed=True)
 
-    # ------------------------------------------------------------------ files
-    def state(self) -> dict[str, Any]:
-        """Return what is to be saved with the map, but for `arrays`."""
-        looks = [
-            [name, len(of.views), of.searched, of.found, of.fitted, of.missed, of.seen, of.surveyed, of.misfit]
-            for name, of in self.looks.items()
-        ]
-        failed = [[*place, frame] for place, frame in self.cells.failed.items()]
-        random = self.random.bit_generator.state
-        beginning = None if self.beginning is None else self.beginning.state()
-        return {
-            "frame": self.frame, "named": self.named, "random": random, "looks": looks, "failed": failed,
-            "beginning": beginning, "is_lost": self.is_lost,
-        }  # fmt: skip
-
-    def arrays(self) -> dict[str, Array]:
-        """Return patches, poses and rays of all views, landmark after landmark, and planes of those that have any."""
-        views, side = [view for look in self.looks.values() for view in look.views], 2 * PATCH + 1
-        planes = [look.plane.numbers for look in self.looks.values() if look.plane is not None]
-        return {
-            "patches": np.array([view.patch for view in views], dtype=np.uint8).reshape(-1, side, side),
-            "poses": np.array([view.T for view in views]).reshape(-1, 7),
-            "rays": np.array([view.rays for view in views]).reshape(-1, 5, 3),
-            "frames": np.array([view.frame for view in views], dtype=np.float64),
-            "planes": np.array(planes).reshape(-1, NUMBERS),
-        }
-
-    def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
-        """Take over what was saved; `read` gives an array by its name and shape."""
-        side, count = 2 * PATCH + 1, sum(int(look[1]) for look in state["looks"])
-        patches = read("patches", (count, side, side)).astype(np.uint8)
-        frames = read("frames", (count,)).astype(np.int64).tolist()
-        views = list(map(View, patches, read("poses", (count, 7)), read("rays", (count, 5, 3)), frames))
-        known = sum(int(look[1]) > 0 for look in state["looks"])
-        planes = iter(read("planes", (known, NUMBERS)))
-        self.looks, at = {}, 0
-        for look in state["looks"]:
-            name, own, *counts, surveyed, misfit = look if len(look) > OLDER else [*look, 0.0]
-            searched, found, fitted, missed, seen = map(int, counts)
-            plane, own_views = Plane.of(next(planes)) if own else None, views[at : at + own]
-            self.looks[name] = Look(
-                searched, found, fitted, missed, seen, float(misfit), own_views, plane, bool(surveyed)
-            )
-            at += own
-        self.frame, self.named, self.is_lost = int(state["frame"]), int(state["named"]), bool(state.get("is_lost"))
-        self.random.bit_generator.state = state["random"]
-        self.cells.failed = {(int(i), int(j)): int(frame) for i, j, frame in state["failed"]}
-        begun = state["beginning"]
-        self.beginning = None if begun is None else Beginning.restored(begun)
+    def restored(self) -> None:
+        """Check the views of a file.  Raises MapError."""
+        side = 2 * PATCH + 1
+        for name, look in self.looks.items():
+            for view in look.views:
+                if (view.patch.shape, view.T.shape, view.rays.shape) != ((side, side), (7,), (5, 3)):
+                    raise MapError(f"a view of landmark {name!r} is a patch {view.patch.shape} from {view.T.shape}")
 
     # ------------------------------------------------------------------ landmarks
     def _taken(self, y: Array, T: Array) -> View | None:

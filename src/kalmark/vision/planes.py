@@ -26,7 +26,6 @@ from kalmark.vision.depth_images import EDGE
 SIGMA_SLOPE = 1.0  # of the prior: 45 deg
 STEEPEST = 2.0  # 63 deg
 REPEATED = 10.0  # frames whose errors of interpolation are the same: what each one of them adds is so much less
-NUMBERS = 9  # of a plane in files
 LEAST_VARIANCE = 4.0  # of grey values about a template
 
 
@@ -43,16 +42,6 @@ class Plane:
         a = np.cross(self.m, np.eye(3)[int(np.abs(self.m).argmin())])
         a /= np.sqrt(a @ a)
         self.across = np.column_stack([a, np.cross(self.m, a)])
-
-    @staticmethod
-    def of(numbers: Array) -> Plane:
-        """Return the plane of these `numbers` (9,)."""
-        return Plane(numbers[:3], numbers[3:5], numbers[5:].reshape(2, 2))
-
-    @property
-    def numbers(self) -> Array:
-        """Return what it is, (9,), for files."""
-        return np.concatenate([self.m, self.slopes, self.information.ravel()])
 
     @property
     def normal(self) -> Array:

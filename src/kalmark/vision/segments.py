@@ -8,8 +8,8 @@ or break, anywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Set
-from dataclasses import astuple, dataclass
+from collections.abc import Set
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -81,6 +81,9 @@ class LineFrontEnd:
     """Searches the frames of one sensor for lines; `looks` has how each looked, `times` what the parts took, s."""
 
     waits: ClassVar[bool] = True
+    looks: dict[Id, LineLook]
+    frame: int
+    named: int
 
     def __init__(self, settings: LineSearch, sensor: Any) -> None:
         self.settings, self.sensor, self.cv2 = settings, sensor, opencv()
@@ -89,8 +92,7 @@ class LineFrontEnd:
             self.cv2.LSD_REFINE_STD, HALVED if width >= WIDE_PX else FULL
         )
         self.beginning: None = None
-        self.looks: dict[Id, LineLook] = {}
-        self.frame = self.named = 0
+        self.looks, self.frame, self.named = {}, 0, 0
         self.expected: Expectations | None = None
         self.found: Matches | None = None
         self._numbers: list[int] = []  # of the segments of the last scan
@@ -205,23 +207,6 @@ class LineFrontEnd:
     def moved(self, poses: list[Array], names: Set[Id]) -> None:
         """Take over that only `names` are left."""
         self.looks = {name: look for name, look in self.looks.items() if name in names}
-
-    def state(self) -> dict[str, Any]:
-        """Return what is to be saved with the map, but for `arrays`."""
-        looks = [[name, *astuple(look)[:-2]] for name, look in self.looks.items()]
-        return {"frame": self.frame, "named": self.named, "looks": looks}
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the profiles of all lines."""
-        return {"profiles": np.array([look.profile for look in self.looks.values()]).reshape(-1, 2 * REACH_PX + 1)}
-
-    def restore(self, state: dict[str, Any], read: Callable[[str, tuple[int, ...]], Array]) -> None:
-        """Take over what was saved; `read` gives an array by its name and shape."""
-        across = read("profiles", (len(state["looks"]), 2 * REACH_PX + 1))
-        for (name, *counts), profile in zip(state["looks"], across, strict=True):
-            searched, found, fitted, missed, seen = map(int, counts)
-            self.looks[name] = LineLook(searched, found, fitted, missed, seen, profile=profile)
-        self.frame, self.named = int(state["frame"]), int(state["named"])
 
 
 def profiles(cv2: Any, image: Any, segments: Array) -> Array:
