@@ -88,8 +88,14 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
     ("override", "what"),
     [
         ("log.robot=3", "log.robot: got an unknown key (value 3), expected one of path, format, robots, "),
-        ("robots.each.motion.sigma_v_mps=-1", "robots.each.motion.sigma_v_mps: got -1, expected a number >= 0"),
-        ("robots.each.motion.sigma_v_mps=.nan", "robots.each.motion.sigma_v_mps: got nan, expected a finite number"),
+        (
+            "robots.each.motion.sigma_v_mps=-1",
+            "robots.each.motion.sigma_v_mps: got -1, expected a number of at least 0",
+        ),
+        (
+            "robots.each.motion.sigma_v_mps=.nan",
+            "robots.each.motion.sigma_v_mps: got nan, expected a finite number",
+        ),
         ("robots.each.motion.sigma_v_mps=true", "robots.each.motion.sigma_v_mps: got true, expected a number"),
         ("robots.each.motion.sigma_v_mps='1'", "robots.each.motion.sigma_v_mps: got '1', expected a number"),
         (
@@ -107,7 +113,7 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ("association.gate=2", "association.gate: got 2, expected a probability between 0 and 1, off or default"),
         ("map.type=sparse", "map.type: got 'sparse', expected one of auto, dense, postponed"),
         ("estimator.iterations=2.5", "estimator.iterations: got 2.5, expected a whole number"),
-        ("estimator.iterations=0", "estimator.iterations: got 0, expected a number >= 1"),
+        ("estimator.iterations=0", "estimator.iterations: got 0, expected a whole number of at least 1"),
         ("log.on_error=skp", "log.on_error: got 'skp', expected one of raise, skip; did you mean skip?"),
         ("log.robots=3", "log.robots: got 3, expected a list"),
         ("log.robots=[1.5]", "log.robots.0: got 1.5, expected a robot's name or number"),
@@ -131,7 +137,7 @@ def test_a_bad_override_is_refused_by_its_own_text(good: Path, override: str, wh
             4,
             "    motion: {type: unicycle, sigma_v_mps: -2}",
             "4:43",
-            "sigma_v_mps: got -2, expected a number >= 0",
+            "sigma_v_mps: got -2, expected a number of at least 0",
         ),
         (4, "    motion: {type: car}", "4:20", "motion.type: got 'car', expected one of unicycle"),
         (4, "    motoin: {type: unicycle}", "4:5", "robots.each.motoin: got an unknown key"),

@@ -225,7 +225,7 @@ def test_what_a_plugin_registers_is_checked_as_kalmark_s_own(plugin: Path, tmp_p
     path = tmp_path / "mine.yaml"
     text = "plugins: [my_models.py]\nrobots:\n  each:\n    sensors:\n      eye: {type: ball, "
     path.write_text(text + "sigma_range_m: -1}\n")
-    with pytest.raises(ConfigError, match=r"mine.yaml:5:40: .*sigma_range_m: got -1, expected a number > 0"):
+    with pytest.raises(ConfigError, match=r"mine.yaml:5:40: .*sigma_range_m: got -1, expected a positive number"):
         load_config(path)
     path.write_text(text + "sigma_rang_m: 1}\n")
     with pytest.raises(ConfigError, match="did you mean sigma_range_m"):

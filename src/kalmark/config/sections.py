@@ -6,9 +6,10 @@ The sections of models are made from their declarations.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, create_model, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
@@ -225,11 +226,12 @@ def _section(role: str, name: str, world: str, models: tuple[type, ...]) -> type
 
 def _field(parameter: Parameter, others: list[Parameter], models: tuple[type, ...]) -> tuple[Any, Any]:
     """Return a parameter as a field; where the plane and space have different defaults, it has none."""
-    kind, default, text = _annotation(parameter), parameter.default, parameter.text
+    default, text = parameter.default, parameter.text
     if any(other.default != default for other in others):
         worlds = [f"{own.default:g} in {_in(model)}" for own, model in zip([parameter, *others], models, strict=True)]
-        kind, default, text = kind | None, None, f"{text[:-1]}; if absent {', '.join(worlds)}."
-    return kind, Field(default=default, description=text or None)
+        default, text = None, f"{text[:-1]}; if absent {', '.join(worlds)}."
+        parameter = replace(parameter, optional=True)
+    return _annotation(parameter), Field(default=default, description=text or None)
 
 
 def _in(model: type) -> str:
@@ -237,32 +239,17 @@ def _in(model: type) -> str:
 
 
 def _annotation(parameter: Parameter) -> Any:
-    """Return what pydantic validates a parameter by."""
-    kind: Any = parameter.type
-    if kind is None:
-        kind = Literal[parameter.words]
-    elif parameter.words:
-        kind = Annotated[Any, PlainValidator(_refusing(parameter))]
-    elif get_origin(kind) is tuple:
-        items = tuple(item if item is ... else _number(item, parameter) for item in get_args(kind))
-        kind = Annotated[tuple[items], Field(strict=False)]  # type: ignore[valid-type]
-    elif kind in (int, float):
-        kind = _number(kind, parameter)
-    return kind | None if parameter.optional else kind
+    """Return what pydantic validates a parameter by: its declaration."""
 
-
-def _number(kind: Any, parameter: Parameter) -> Any:
-    bounds: dict[str, Any] = dict(parameter.within.limits)
-    return Annotated[kind, Field(**bounds, allow_inf_nan=None if kind is int else parameter.within.infinite)]
-
-
-def _refusing(parameter: Parameter) -> Any:
     def validated(value: Any) -> Any:
-        if parameter.refused(value):
-            raise expected(parameter.wanted)
-        return value
+        wanted = parameter.refused(value)
+        if wanted and parameter.type is None:
+            raise PydanticCustomError("literal_error", "another word", {"expected": str(parameter.words)})
+        if wanted:
+            raise expected(wanted)
+        return tuple(value) if isinstance(value, list) else value
 
-    return validated
+    return Annotated[Any, PlainValidator(validated)]
 
 
 def model_of(section: Any, world: str = "plane") -> Any:
