@@ -1,7 +1,7 @@
 """A codec of records by their type hints: JSON, and beside it one array of the numbers of all arrays.
 
 A dataclass or a named tuple is saved as its fields.  An object of another class is saved as the attributes that the
-class's body annotates, or names as `SAVED`.  It is filled in place, and `restored`, if it has that, computes the rest.
+class's body annotates, or names as `SAVED`, and is filled in place.  `restored`, if there is that, computes the rest.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, ClassVar, Literal, Protocol, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -61,14 +61,19 @@ def place(of: Reader | Writer) -> str:
     return ".".join(map(str, of.at))
 
 
-class Kind(Protocol):
-    """How values of one hint are written and read.  Both raise MapError for a value of another type."""
+class Kind:
+    """How values of one hint are written and read: here those that JSON has as they are.
+
+    Both raise MapError for a value of another type.
+    """
 
     def write(self, writer: Writer, value: Any) -> Any:
         """Return a value as JSON has it."""
+        return value
 
     def read(self, reader: Reader, says: Any, now: Any) -> Any:
         """Return a value; `now` is what there is, which is filled where it has a state."""
+        return says
 
 
 @cache
@@ -83,7 +88,7 @@ def kind_of(hint: Any) -> Kind:
     if origin is np.ndarray:
         return _Numbers(get_args(args[1])[0])
     if origin is dict:
-        return _Plain() if args == (str, Any) else _Mapping(kind_of(args[0]), kind_of(args[1]))
+        return Kind() if args == (str, Any) else _Mapping(kind_of(args[0]), kind_of(args[1]))
     if origin in (list, set, frozenset) or args[1:] == (...,):
         return _Sequence(origin, kind_of(args[0]))
     if origin is tuple:
@@ -102,7 +107,7 @@ def kind_of(hint: Any) -> Kind:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Scalar:
+class _Scalar(Kind):
     types: tuple[type, ...]
     expected: str
     words: tuple[str, ...] = ()
@@ -128,17 +133,7 @@ SIMPLE: dict[type, Kind] = {
 }
 
 
-class _Plain:
-    """A dict that is JSON as it is."""
-
-    def write(self, writer: Writer, value: Any) -> Any:
-        return value
-
-    def read(self, reader: Reader, says: Any, now: Any) -> Any:
-        return says
-
-
-class _Random:
+class _Random(Kind):
     """A generator of random numbers, by its state."""
 
     def write(self, writer: Writer, value: Any) -> Any:
@@ -150,7 +145,7 @@ class _Random:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Optional:
+class _Optional(Kind):
     of: Kind
 
     def write(self, writer: Writer, value: Any) -> Any:
@@ -161,7 +156,7 @@ class _Optional:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Numbers:
+class _Numbers(Kind):
     dtype: Any
 
     def write(self, writer: Writer, value: Any) -> Any:
@@ -172,7 +167,7 @@ class _Numbers:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Member:
+class _Member(Kind):
     of: type[Enum]
 
     def write(self, writer: Writer, value: Any) -> Any:
@@ -183,7 +178,7 @@ class _Member:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Sequence:
+class _Sequence(Kind):
     make: Callable[[Any], Any]
     of: Kind
 
@@ -196,7 +191,7 @@ class _Sequence:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Tuple:
+class _Tuple(Kind):
     make: Callable[[Any], Any]
     of: tuple[Kind, ...]
 
@@ -208,7 +203,7 @@ class _Tuple:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Mapping:
+class _Mapping(Kind):
     """Pairs; where there are objects with a state, their keys are the same."""
 
     key: Kind
@@ -235,7 +230,7 @@ class _Mapping:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Object:
+class _Object(Kind):
     """A record by its fields, or another object by its parts."""
 
     of: type
@@ -262,9 +257,10 @@ class _Object:
             found[name] = kind.read(reader, says[name], getattr(now, name, None))
             reader.at.pop()
         if is_record:
-            return self.of(**found)
-        for name, value in found.items():
-            setattr(now, name, value)
+            now = self.of(**found)
+        else:
+            for name, value in found.items():
+                setattr(now, name, value)
         if hasattr(now, "restored"):
             now.restored()
         return now

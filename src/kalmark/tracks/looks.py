@@ -81,7 +81,8 @@ class Looks:
         np.add.at(self.counts[1], cells.ravel(), 1.0)
         np.add.at(self.counts[0], cells[seen].ravel(), 1.0)
 
-    def __post_init__(self) -> None:
+    def restored(self) -> None:
+        """Check the arrays of a file.  Raises MapError."""
         if self.counts.shape != (2, CELLS) or self.table.shape != (CELLS,):
             raise MapError(f"the counts of looks are {self.counts.shape} and {self.table.shape}, expected {(2, CELLS)}")
 
