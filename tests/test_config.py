@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from kalmark.config import load_config, open_run, resolve_config, shipped_configs
-from kalmark.config.schema import LogConfig
+from kalmark.config.schema import options_of_formats
 from kalmark.config.tree import name_of, name_on
 from kalmark.errors import ConfigError
 from kalmark.logs import FORMATS
@@ -308,9 +308,10 @@ def test_a_start_of_space_may_have_a_sigma_for_each_axis(tmp_path: Path) -> None
         assert message.endswith("expected a number >= 0, or a list of three: one for each axis")
 
 
-def test_every_option_of_a_log_format_is_a_key() -> None:
+def test_every_option_of_a_log_format_is_a_key_with_its_line_of_documentation() -> None:
     options = {option for entry in FORMATS.values() for option in entry.options}
-    assert options <= set(LogConfig.model_fields)
+    assert options <= set(options_of_formats(tuple(FORMATS.values())).model_fields)
+    assert all(option.text for entry in FORMATS.values() for option in entry.options.values())
 
 
 def test_a_file_is_called_by_its_name_or_by_its_folder_if_all_such_files_have_that_name() -> None:

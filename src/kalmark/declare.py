@@ -15,7 +15,7 @@ import inspect
 import math
 import operator
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import util
@@ -99,8 +99,19 @@ Count = Annotated[int, Within(ge=1)]
 
 
 @dataclass(frozen=True)
+class Values:
+    """The values of a mapping: models of a `role`, each with its `type`, or texts.
+
+    A text with this `ending` is a file, which is looked for beside the configuration.
+    """
+
+    role: str = ""
+    ending: str = ""
+
+
+@dataclass(frozen=True)
 class Parameter:
-    """A field of a model: `type` is without None and without the `words` that it may be instead."""
+    """A field of a model, or an option: `type` is without None and without the `words` that it may be instead."""
 
     name: str
     type: Any
@@ -109,6 +120,7 @@ class Parameter:
     words: tuple[str, ...]
     within: Within
     text: str
+    values: Values | None = None
 
     @property
     def unit(self) -> str:
@@ -147,7 +159,11 @@ class Parameter:
             one = Parameter("", kind, None, False, (), self.within, "")
             if isinstance(value, list | tuple) and size in (None, len(value)) and not any(map(one.refused, value)):
                 return ""
-            return "a list of finite numbers" if size is None else f"{size} numbers, each {one.wanted}"
+            if size is None:
+                return "a list of texts" if kind is str else "a list of finite numbers"
+            return f"{size} numbers, each {one.wanted}"
+        if self.values is not None:
+            return "" if isinstance(value, Mapping) else "a mapping"
         return "" if self.type is Any else self.wanted
 
 
@@ -165,28 +181,40 @@ def parameters(model: type) -> tuple[Parameter, ...]:
 def _parameters(model: Any) -> tuple[Parameter, ...]:
     if not dataclasses.is_dataclass(model):
         return ()
-    try:
-        hints = get_type_hints(model, include_extras=True)
-    except NameError:  # a user's own, whose types only a checker knows
-        hints = {}
+    hints = _hints(model)
     fields = sorted((field for field in dataclasses.fields(model) if field.init), key=lambda field: bool(field.kw_only))
-    return tuple(_parameter(field, hints.get(field.name, Any)) for field in fields)
+    return tuple(_parameter(field.name, field.default, hints.get(field.name, Any)) for field in fields)
 
 
-def _parameter(field: dataclasses.Field[Any], hint: Any) -> Parameter:
+def options_of(function: Callable[..., Any], after: int) -> tuple[Parameter, ...]:
+    """Return the parameters of a function behind the first ones, declared as those of a model are."""
+    hints = _hints(function)
+    named = [*inspect.signature(function).parameters.values()][after:]
+    return tuple(_parameter(each.name, each.default, hints.get(each.name, Any)) for each in named)
+
+
+def _hints(of: Any) -> dict[str, Any]:
+    try:
+        return get_type_hints(of, include_extras=True)
+    except (NameError, TypeError):  # of a user: types that only a checker knows, or an object that is called
+        return {}
+
+
+def _parameter(name: str, default: Any, hint: Any) -> Parameter:
     hint, *extras = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     words = tuple(word for part in parts if get_origin(part) is Literal for word in get_args(part))
     kinds = [part for part in parts if part is not NoneType and get_origin(part) is not Literal]
     bounds = next((extra for extra in extras if isinstance(extra, Within)), Within(infinite=True))
     return Parameter(
-        field.name,
+        name,
         kinds[0] if len(kinds) == 1 else Any if kinds else None,
-        None if field.default is dataclasses.MISSING else field.default,
+        None if default in (dataclasses.MISSING, inspect.Parameter.empty) else default,
         NoneType in parts,
         words,
         bounds,
         "".join(extra for extra in reversed(extras) if isinstance(extra, str)),
+        next((extra for extra in extras if isinstance(extra, Values)), None),
     )
 
 

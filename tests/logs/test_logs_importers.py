@@ -64,7 +64,7 @@ def test_mrclam_reads_on_when_asked_to_skip(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"bearing_shift_s": "late"}, "bearing_shift_s is 'late'"), ({"robot_sightings": 3}, "expected true or false")],
+    [({"bearing_shift_s": "late"}, "bearing_shift_s is 'late'"), ({"robot_sightings": 3}, "expected True or False")],
 )
 def test_mrclam_options_are_checked(options: dict, message: str, tmp_path: Path) -> None:
     with pytest.raises(LogError, match=message):
@@ -147,7 +147,7 @@ def test_bad_values_in_a_matlab_file_are_named(changes: dict, message: str, tmp_
 
 def test_a_negative_reach_is_refused(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "dataset2.mat", woods())
-    with pytest.raises(LogError, match="r_max is -1, expected a finite number of at least 0"):
+    with pytest.raises(LogError, match="r_max is -1, expected a positive number"):
         open_log(tmp_path, r_max=-1)
 
 

@@ -105,8 +105,7 @@ def config_dict(config: Config) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """Return sections as mappings; a key without value only where the user wrote it, to undo what the log describes."""
     if isinstance(value, BaseModel):
-        fields = {name: getattr(value, name) for name in type(value).model_fields}
-        return {n: _plain(v) for n, v in fields.items() if v is not None or n in value.model_fields_set}
+        return {n: _plain(v) for n, v in value if v is not None or n in value.model_fields_set}
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, tuple) else value

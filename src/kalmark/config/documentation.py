@@ -18,6 +18,7 @@ from kalmark.config import schema
 from kalmark.config.reading import shipped_configs
 from kalmark.config.sections import BASES, Section, section_of
 from kalmark.declare import classes, is_own, unit_of
+from kalmark.logs import FORMATS
 
 HEAD = """\
 # Configuration
@@ -68,7 +69,7 @@ def page() -> str:
     of_sensor = "`robots.NAME.sensors.SENSOR"
     parts = [HEAD.format(names=", ".join(f"`{n}`" for n in shipped_configs()))]
     parts += [_section("The file", schema.Config)]
-    parts += [_section("`log`", schema.LogConfig), _choice("`log.topics.TOPIC`, of a bag", "topic")]
+    parts += [_section("`log`", schema.LogConfig), _options(), _choice("`log.topics.TOPIC`, of a bag", "topic")]
     parts += [_section("`robots.NAME`", schema.RobotConfig)]
     parts += [_section("`robots.NAME.start`, in the plane", schema.StartConfig)]
     parts += [_section("`robots.NAME.start`, in space", schema.SpaceStartConfig)]
@@ -91,6 +92,14 @@ def page() -> str:
 
 def _section(title: str, model: type[BaseModel], common: type[BaseModel] = Section) -> str:
     return f"## {title}\n\n{inspect.getdoc(model)}\n\n{_table(model, common)}\n"
+
+
+def _options() -> str:
+    """Return the options of the formats of logs, each beside the defaults of its reader."""
+    declared = [(entry.name, option) for entry in FORMATS.values() for option in entry.options.values()]
+    rows = [f"| `{o.name}` | {name} | {_value(o.default)} | {o.unit} | {o.text} |" for name, o in declared]
+    head = "## `log`, by format\n\nOptions of one format each.\n\n| key | format | default | unit | meaning |\n"
+    return head + "\n".join(["|---|---|---|---|---|", *rows, ""])
 
 
 def _choice(title: str, role: str, world: str = "") -> str:
@@ -127,7 +136,10 @@ def _texts(model: type[BaseModel]) -> dict[str, str]:
 
 
 def _default(field: Any) -> str:
-    value = field.get_default(call_default_factory=True)
+    return _value(field.get_default(call_default_factory=True))
+
+
+def _value(value: Any) -> str:
     if value is None or value is PydanticUndefined:
         return ""
     if isinstance(value, BaseModel):

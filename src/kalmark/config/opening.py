@@ -89,8 +89,7 @@ def described(config: Config, log: Log) -> Config:
 def in_force(config: Config, log_path: str | Path | None = None) -> Config:
     """Return the configuration with its log's path found, or replaced by `log_path`.  Raises ConfigError, LogError."""
     named: dict[str, Any] = {name: beside(config, getattr(config.log, name)) for name in ("truth", "fixes")}
-    named["definitions"] = definitions(config)
-    log = config.log.model_copy(update=named | {"path": str(find_log(config, log_path))})
+    log = config.log.model_copy(update=named | found_options(config) | {"path": str(find_log(config, log_path))})
     return config.model_copy(update={"log": log})
 
 
@@ -100,17 +99,21 @@ def open_config_log(config: Config, log_path: str | Path | None = None, *, progr
     check_format(config, path)
     common = log.model_dump(include={*COMMON})
     common |= {name: beside(config, common[name]) for name in ("truth", "fixes")}
-    options = log.options() | ({"definitions": definitions(config)} if log.definitions else {})
-    found = open_log(path, log.format, **common, **options, progress=progress)
+    found = open_log(path, log.format, **common, **found_options(config), progress=progress)
     if not found.events:
         raise LogError(f"{path}: true poses alone, expected a log with events; as `log.truth` it scores one")
     return found
 
 
-def definitions(config: Config) -> dict[str, str] | None:
-    """Return the definitions of types of messages of a configuration, with the files found.  Raises LogError."""
-    given = config.log.definitions or {}
-    return {kind: str(beside(config, d)) if d.endswith(".msg") else d for kind, d in given.items()} or None
+def found_options(config: Config) -> dict[str, Any]:
+    """Return the options of a configuration's log, with the files found that they name.  Raises LogError."""
+    options = config.log.options()
+    for option in (option for entry in FORMATS.values() for option in entry.options.values()):
+        ending = option.values.ending if option.values else ""
+        if ending and option.name in options:
+            given = options[option.name].items()
+            options[option.name] = {k: str(beside(config, v)) if v.endswith(ending) else v for k, v in given}
+    return options
 
 
 def beside(config: Config, path: Any) -> Any:

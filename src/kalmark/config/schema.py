@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
+from pydantic import ConfigDict, Discriminator, Field, PrivateAttr, Tag, create_model, model_validator
 
 from kalmark.config.sections import (
     BASES,
@@ -19,15 +20,19 @@ from kalmark.config.sections import (
     RobotName,
     Section,
     Sigmas,
+    annotation,
     expected,
     model_of,
     section_of,
+    unknown_key,
 )
 from kalmark.config.tree import OVERRIDE, name_of
 from kalmark.declare import classes, register, registered_name
 from kalmark.errors import ConfigError
 from kalmark.events import LONGEST_PAUSE_S
 from kalmark.geometry.named_poses import world_of
+from kalmark.logs import FORMATS
+from kalmark.logs.source import Format
 from kalmark.models.protocols import state_columns
 from kalmark.slam.description import STATES, known, sigma_of
 
@@ -39,7 +44,6 @@ Initialization = Annotated[Any, Choice("initialization", default="immediate")]
 Detector = Annotated[Any, Choice("detector")]
 Attention = Annotated[Any, Choice("attention", typed=False)]
 Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
-Topic = Annotated[Any, Choice("topic")]
 
 Plugins = Annotated[tuple[str, ...], Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
@@ -283,7 +287,9 @@ BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]
 
 
 class LogConfig(Section):
-    """Which log, and how much of it."""
+    """Which log, and how much of it; and the options of its format, see below."""
+
+    model_config = ConfigDict(extra="allow")
 
     path: str | None = None
     """Folder or file; beside this file, in KALMARK_DATA or downloaded."""
@@ -313,55 +319,33 @@ class LogConfig(Section):
     """Added to the times of the scans of a sensor, by its name; of one robot: `{rover: {laser: .1}}`."""
     increments: Literal["recorded", "cut"] = "cut"
     """`cut`: a scan between the ends of two increments cuts the second, and finds its robot where it was then."""
-    origin: list[Number] | None = None
-    """native: [latitude_deg, longitude_deg, height_m] of the origin of positions on the globe (the first if absent)."""
-    vertices: Literal["none", "truth"] | None = None
-    """g2o: `truth` takes the vertices as true poses and landmarks (none if absent)."""
-    r_max: Positive | None = None
-    """lost_in_the_woods: drop observations beyond this range."""
-    measured: Literal["range_bearing", "bearing"] | None = None
-    """lost_in_the_woods: take ranges and bearings, or bearings alone (range_bearing if absent)."""
-    bearing_shift_s: Number | None = None
-    """mrclam: added to the time of every observation."""
-    robot_sightings: bool | None = None
-    """mrclam: use the robots' sightings of each other (true if absent)."""
-    covariance_scale: Positive | None = None
-    """dlr: multiplies all covariances of the file."""
-    detections: Literal["laser", "slsjf", "rfs"] | None = None
-    """victoria_park: which detections."""
-    steering: Literal["ascii", "mat"] | None = None
-    """victoria_park: which steering calibration."""
-    min_disparity_px: NotNegative | None = None
-    """kitti_stereo_features: drop observations with a smaller disparity (1 if absent)."""
-    rates: Literal["mean", "held"] | None = None
-    """kitti_stereo_features: hold the mean of two rates between them, or the first (mean if absent)."""
-    tag_size_m: Positive | None = None
-    """tagslam: size of the tags that tagslam.yaml gives none of their own."""
-    cameras: Literal["all", "given"] | Annotated[tuple[str, ...], Field(strict=False)] | None = None
-    """tagslam: all, or those with a pose in camera_poses.yaml (all if absent); euroc: a list of names ([cam0])."""
-    odometry: Literal["auto", "none"] | None = None
-    """tagslam: use the odometry of the bag (auto if absent)."""
-    sigma_px: Positive | None = None
-    """tagslam: noise of a corner's coordinate (the pixel_noise of tagslam.yaml if absent)."""
-    fps: Positive | None = None
-    """images, video: images a second, where they have no times, or others."""
-    imu: Literal["auto", "none"] | None = None
-    """euroc: let the inertial unit move the robot (auto if absent)."""
-    depth: Literal["auto", "none"] | None = None
-    """tum_rgbd: take the depth images (auto if absent)."""
-    depth_scale: Positive | None = None
-    """tum_rgbd: the number of 1 m in a depth image (5000 if absent)."""
-    right: Literal["auto", "none"] | None = None
-    """kitti_odometry: take the images of the right camera (auto if absent)."""
-    topics: dict[str, Topic] | None = None
-    """bag: topics by name, and what each of them is in the log, see below."""
-    definitions: dict[str, str] | None = None
-    """bag: types of messages that it does not define, each with its .msg file, or the text of one."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, value: Any) -> Any:
+        given = {key: value[key] for key in value if key not in cls.model_fields} if isinstance(value, dict) else {}
+        if not given:
+            return value
+        section = options_of_formats(tuple(FORMATS.values()))
+        for key in given:
+            if key not in section.model_fields:
+                raise unknown_key(key, "an unknown key", [*cls.model_fields, *section.model_fields])
+        checked = section.model_validate(given)
+        return value | {key: getattr(checked, key) for key in given}
 
     def options(self) -> dict[str, Any]:
         """Return the keys that only some formats have, as given."""
-        common = {"path", "format", *COMMON}
-        return self.model_dump(exclude=common, exclude_none=True)
+        return self.model_dump(include={*(self.model_extra or ())}, exclude_none=True)
+
+
+@cache
+def options_of_formats(formats: tuple[Format, ...]) -> type[Section]:
+    """Return the section of the options of all formats: one that several have takes what one of them does."""
+    kinds: dict[str, Any] = {}
+    for option in (option for entry in formats for option in entry.options.values()):
+        kinds[option.name] = annotation(option) | kinds.get(option.name)
+    fields: Any = {name: (kind, None) for name, kind in kinds.items()}
+    return create_model("LogOptions", __base__=Section, **fields)
 
 
 class _AnyRobot(Section):

@@ -17,7 +17,6 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 import kalmark.association
 import kalmark.detect
 import kalmark.filter.estimators
-import kalmark.logs.bag.topics
 import kalmark.management.attention
 import kalmark.management.initialization
 import kalmark.management.upkeep
@@ -64,10 +63,13 @@ class Section(BaseModel):
         if isinstance(value, dict):
             for key in value:
                 if key not in cls.model_fields:
-                    what = cls.elsewhere.get(key, "an unknown key")
-                    told = {"key": key, "what": what, "keys": [*cls.model_fields]}
-                    raise PydanticCustomError("unknown_key", "unknown key", told)
+                    raise unknown_key(key, cls.elsewhere.get(key, "an unknown key"), [*cls.model_fields])
         return value
+
+
+def unknown_key(key: str, what: str, keys: list[str]) -> PydanticCustomError:
+    """Return the error of a key that a section with these keys does not have."""
+    return PydanticCustomError("unknown_key", "unknown key", {"key": key, "what": what, "keys": keys})
 
 
 def expected(what: str, *below: str) -> PydanticCustomError:
@@ -231,15 +233,19 @@ def _field(parameter: Parameter, others: list[Parameter], models: tuple[type, ..
         worlds = [f"{own.default:g} in {_in(model)}" for own, model in zip([parameter, *others], models, strict=True)]
         default, text = None, f"{text[:-1]}; if absent {', '.join(worlds)}."
         parameter = replace(parameter, optional=True)
-    return _annotation(parameter), Field(default=default, description=text or None)
+    return annotation(parameter), Field(default=default, description=text or None)
 
 
 def _in(model: type) -> str:
     return "the plane" if world_of_class(model) == "plane" else "space"
 
 
-def _annotation(parameter: Parameter) -> Any:
+def annotation(parameter: Parameter) -> Any:
     """Return what pydantic validates a parameter by: its declaration."""
+    if parameter.values is not None:
+        role = parameter.values.role
+        kind = dict[str, Annotated[Any, Choice(role)] if role else str]  # type: ignore[misc, valid-type]
+        return kind | None if parameter.optional else kind
 
     def validated(value: Any) -> Any:
         wanted = parameter.refused(value)

@@ -77,10 +77,7 @@ def open_log(
     Raises LogError, with ``file:line:`` for a bad row.
     """
     entry, found = recognise(find_data(path), format)
-    for name in options:
-        if name not in entry.options:
-            wanted = f"{', '.join(entry.options) or 'none'}{nearest(name, entry.options)}"
-            raise LogError(f"log option {name!r} is unknown to {entry.name}, expected {wanted}")
+    entry.refuse_options(options)
     request = requested(robot_names(robots, entry.robot_prefix), on_error, progress)
     log = corrected(entry.read(found, request, **options), factors, shift_s)
     refuse_overflow(log)

@@ -32,7 +32,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -47,7 +47,6 @@ from kalmark.logs.source import (
     STEP_NS,
     Format,
     Request,
-    choice,
     landmark_id,
     number,
     one_robot,
@@ -182,8 +181,14 @@ def _take_edge(graph: Graph, tag: str, cells: list[str]) -> None:
     graph.moves.setdefault((a, b), control(step, C))
 
 
-def read(path: Path, request: Request, vertices: Any = None) -> Log:
-    """Return the log; with `vertices` "truth" the vertices are the true poses and landmarks, else they are not used."""
+def read(
+    path: Path,
+    request: Request,
+    vertices: Annotated[
+        Literal["none", "truth"], "`truth` takes the vertices as true poses and landmarks; else they are not used."
+    ] = "none",
+) -> Log:
+    """Return the log."""
     graph = Graph()
     for line, (tag, *cells) in rows(path):
         try:
@@ -193,7 +198,7 @@ def read(path: Path, request: Request, vertices: Any = None) -> Log:
     ids = sorted({*graph.poses, *(at for _, at in graph.sights), *(one for pair in graph.moves for one in pair)})
     for reason, count in sorted(graph.left_out.items()):
         request.leave_out(count, f"{path}: {count} {reason}")
-    return _log(path, request, graph, ids, choice(vertices or "none", "vertices", ("none", "truth")) == "truth")
+    return _log(path, request, graph, ids, vertices == "truth")
 
 
 def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool) -> Log:
@@ -268,6 +273,5 @@ G2O = Format(
     "a graph of poses and landmarks, .g2o; of TORO .graph, .toro",
     find,
     read,
-    options=("vertices",),
     describes_all=True,
 )

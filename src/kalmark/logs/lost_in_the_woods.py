@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
 
+from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.logs.array_files import arrays, events_of, find_variables, times
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Request, one_robot, quantity
+from kalmark.logs.source import Format, Request, one_robot
 from kalmark.logs.table_columns import BEAM
 
 ROBOT, SENSOR, FILE = "robot", "laser", "dataset2.mat"
@@ -22,17 +23,20 @@ COLUMNS = {"range_bearing": BEAM, "bearing": ("bearing_rad",)}
 NAMES = ("t", "v", "om", "r", "b", "l", "x_true", "y_true", "th_true", "true_valid")
 
 
-def read(path: Path, request: Request, r_max: Any = None, measured: Any = "range_bearing") -> Log:
-    """Return the log; ranges over `r_max` m are dropped, as the course does (None: all are kept).
-
-    Of what was `measured` only bearings may be asked for, "bearing".
+def read(
+    path: Path,
+    request: Request,
+    r_max: Annotated[float | None, Within(gt=0), "Drop observations beyond this range, as the course does."] = None,
+    measured: Annotated[
+        Literal["range_bearing", "bearing"], "Take ranges and bearings, or bearings alone."
+    ] = "range_bearing",
+) -> Log:
+    """Return the log.
 
     A control at t acts from t on and the scan at t is of the same instant; a range of 0 means "not seen".  A scan that
     saw nothing stays in the log, empty: the robot's path is scored there too.
     """
-    if measured not in COLUMNS:
-        raise LogError(f"{path}: measured is {measured!r}, expected {' or '.join(COLUMNS)}")
-    limit = float("inf") if r_max is None else quantity(r_max, "r_max", 0.0)
+    limit = float("inf") if r_max is None else r_max
     data = arrays(path, NAMES)
     count = data["t"].size
     for name, value in data.items():
@@ -62,4 +66,4 @@ def read(path: Path, request: Request, r_max: Any = None, measured: Any = "range
 
 
 find = partial(find_variables, FILE, NAMES)
-LOST_IN_THE_WOODS = Format("lost_in_the_woods", f"{FILE} or its folder", find, read, options=("r_max", "measured"))
+LOST_IN_THE_WOODS = Format("lost_in_the_woods", f"{FILE} or its folder", find, read)

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+from kalmark.declare import Number
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order, shown
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Request, nearest, quantity, read_points, rows, timed_rows
+from kalmark.logs.source import Format, Request, nearest, read_points, rows, timed_rows
 from kalmark.logs.table_columns import BEAM
 
 SENSOR = "camera"
@@ -36,19 +37,22 @@ def robots_in(folder: Path) -> tuple[str, ...]:
     return tuple(f"robot{n}" for n in sorted(numbers))
 
 
-def read(path: Path, request: Request, bearing_shift_s: Any = 0.0, robot_sightings: Any = True) -> Log:
+def read(
+    path: Path,
+    request: Request,
+    bearing_shift_s: Annotated[Number, "Added to the time of every observation."] = 0.0,
+    robot_sightings: Annotated[bool, "Use the robots' sightings of each other."] = True,
+) -> Log:
     """Return the log of the wanted robots; measurements take the time of their stamp plus `bearing_shift_s`.
 
     Measurements of barcodes that belong to no subject are left out and always listed in `skipped`, those of other
     robots only with `robot_sightings=False`.
     """
-    if not isinstance(robot_sightings, bool):
-        raise LogError(f"log option robot_sightings is {robot_sightings!r}, expected true or false")
     present = robots_in(path)
     for robot in request.robots or ():
         if robot not in present:
             raise LogError(f"{path}: no robot {robot!r}, expected one of {', '.join(present)}{nearest(robot, present)}")
-    shift_ns = round(quantity(bearing_shift_s, "bearing_shift_s") * 1e9)
+    shift_ns = round(bearing_shift_s * 1e9)
     subjects = read_barcodes(path / "Barcodes.dat", request)
     ignored = () if robot_sightings else MRCLAM_ROBOTS
     robots = tuple(robot for robot in present if request.wants(robot))
@@ -129,4 +133,4 @@ def read_truth(path: Path, request: Request) -> Trajectory:
 
 
 MRCLAM = Format("mrclam", "a folder with Barcodes.dat and RobotN_Odometry.dat, RobotN_Measurement.dat", find, read,
-                options=("bearing_shift_s", "robot_sightings"), robot_prefix="robot")  # fmt: skip
+                robot_prefix="robot")  # fmt: skip

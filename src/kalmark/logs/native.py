@@ -30,7 +30,7 @@ from difflib import get_close_matches
 from heapq import merge
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -60,12 +60,14 @@ Places = dict[tuple[Path, str, str], int]
 NEAR = 0.65  # of difflib's ratio
 
 
-def read(path: Path, request: Request, origin: Any = None) -> Log:
-    """Return the native log in a folder.  Raises LogError with file and line.
-
-    `origin`: latitude, longitude (deg) and height (m) of the map's origin, where positions are on the globe; their
-    first one if it is None.
-    """
+def read(
+    path: Path,
+    request: Request,
+    origin: Annotated[
+        Any, "[latitude_deg, longitude_deg, height_m] of the origin of positions on the globe; the first one if absent."
+    ] = None,
+) -> Log:
+    """Return the native log in a folder.  Raises LogError with file and line."""
     there = tables(path)
     if not {*EVENTS} & there.keys():
         raise LogError(
@@ -399,6 +401,4 @@ def _letters(name: str) -> str:
 
 
 ANY = (*FILES, *(Path(name).with_suffix(PARQUET).name for name in FILES))
-NATIVE = Format(
-    "native", "a folder with controls.csv, scans.csv", lambda path: folder_of(path, ANY), read, options=("origin",)
-)
+NATIVE = Format("native", "a folder with controls.csv, scans.csv", lambda path: folder_of(path, ANY), read)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from kalmark.arrays import Array
+from kalmark.declare import Parameter, options_of
 from kalmark.errors import LogError
 from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, order, shown
 from kalmark.files import refuse_aliases
@@ -76,16 +78,34 @@ class Request:
 class Format:
     """Describe one log format: how to tell it (`find` gives the path to read, or None) and how to read it.
 
-    With `describes_all` a log says all that a configuration needs.
+    `read` takes that path, a `Request`, and the format's own options, each declared as a parameter of a model is: from
+    the annotations follow their checks, keys of configurations and documentation.  With `describes_all` a log says all
+    that a configuration needs.
     """
 
     name: str
     what: str
     find: Callable[[Path], Path | None]
     read: Callable[..., Log]
-    options: tuple[str, ...] = ()
     robot_prefix: str = ""
     describes_all: bool = False
+
+    @cached_property
+    def options(self) -> dict[str, Parameter]:
+        """The options that its logs may be read with, by name."""
+        return {option.name: option for option in options_of(self.read, 2)}
+
+    def refuse_options(self, given: Mapping[str, Any]) -> None:
+        """Refuse options that it does not have, and values that are not as declared.  Raises LogError."""
+        for name, value in given.items():
+            if name not in self.options:
+                wanted = f"{', '.join(self.options) or 'none'}{nearest(name, self.options)}"
+                raise LogError(f"log option {name!r} is unknown to {self.name}, expected {wanted}")
+            option = self.options[name]
+            if wanted := option.refused(value):
+                raise LogError(
+                    f"log option {name} is {shown(value)}, expected {wanted}{nearest(str(value), option.words)}"
+                )
 
 
 def one_robot(

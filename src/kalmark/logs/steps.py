@@ -19,11 +19,12 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, shown
 from kalmark.logs.log import Log
@@ -35,7 +36,6 @@ from kalmark.logs.source import (
     landmark_id,
     number,
     one_robot,
-    quantity,
     read_points,
     rows,
 )
@@ -100,17 +100,17 @@ def events_of(
     return events
 
 
-def read_dlr(path: Path, request: Request, covariance_scale: Any = None) -> Log:
-    """Return the log; the id -1 (spurious) becomes None.
-
-    `covariance_scale` multiplies all covariances of the file (None: they stay as they are).
-    """
-    scale = 1.0 if covariance_scale is None else quantity(covariance_scale, "covariance_scale", 1e-9)
+def read_dlr(
+    path: Path,
+    request: Request,
+    covariance_scale: Annotated[float, Within(ge=1e-9), "Multiplies all covariances of the file."] = 1.0,
+) -> Log:
+    """Return the log; the id -1 (spurious) becomes None."""
     expected = (
         "STEP image dX dY dPhi cXX cXY cYY cXPhi cYPhi cPhiPhi"
         " or LANDMARK_C pX pY quality cXX cXY cYY id, with covariances that are positive definite"
     )
-    events = events_of(path, request, "camera", partial(dlr_record, scale=scale), expected, "STEP lines")
+    events = events_of(path, request, "camera", partial(dlr_record, scale=covariance_scale), expected, "STEP lines")
     return one_robot("dlr", path, request, ROBOT, events, INCREMENT2, {"camera": POSITION[:2]})
 
 
@@ -156,7 +156,6 @@ def freiburg_record(where: str, cells: list[str], request: Request) -> Record | 
 
 
 DLR = Format("dlr", "map.circles or its folder",
-             partial(find, name="map.circles", starts=(b"STEP ", b"LANDMARK_C ")), read_dlr,
-             options=("covariance_scale",))  # fmt: skip
+             partial(find, name="map.circles", starts=(b"STEP ", b"LANDMARK_C ")), read_dlr)  # fmt: skip
 FREIBURG = Format("freiburg_course", "sensor_data.dat or its folder",
                   partial(find, name="sensor_data.dat", starts=(b"ODOMETRY ", b"SENSOR ")), read_freiburg)  # fmt: skip

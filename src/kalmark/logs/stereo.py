@@ -9,17 +9,18 @@ from __future__ import annotations
 import zipfile
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.declare import NotNegative
 from kalmark.errors import LogError
 from kalmark.files import read_arrays
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.array_files import arrays, events_of, find_variables, refuse_shapes, times
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Request, choice, frame, one_robot, quantity
+from kalmark.logs.source import Format, Request, frame, one_robot
 from kalmark.logs.table_columns import TWIST3
 
 SENSOR = "stereo"
@@ -94,14 +95,18 @@ def find_kitti(path: Path) -> Path | None:
         return None
 
 
-def read_kitti(path: Path, request: Request, min_disparity_px: Any = 1.0, rates: Any = "mean") -> Log:
+def read_kitti(
+    path: Path,
+    request: Request,
+    min_disparity_px: Annotated[NotNegative, "Drop observations with a smaller disparity."] = 1.0,
+    rates: Annotated[Literal["mean", "held"], "Hold the mean of two rates between them, or the first."] = "mean",
+) -> Log:
     """Return the log; observations with a disparity below `min_disparity_px` are left out and counted.
 
     The rates are instantaneous: `rates="mean"` holds from t_k on the mean of those at t_k and t_{k+1}, `"held"` those
     at t_k alone.  The translation in `cam_T_imu` is the camera's position in the frame of the inertial unit, as KITTI's
     own calibration confirms: p_c = R (p_i - t), not R p_i + t.
     """
-    low = quantity(min_disparity_px, "min_disparity_px")
     found = read_arrays(path, LogError)
     data = {name: np.asarray(found[name], dtype=np.float64) for name in KITTI}
     y, steps, K, T = data["features"], data["time_stamps"].size, data["K"], data["cam_T_imu"]
@@ -113,12 +118,12 @@ def read_kitti(path: Path, request: Request, min_disparity_px: Any = 1.0, rates:
             raise LogError(f"{path}: {name} holds a value that is not finite, expected finite numbers")
     t_ns = times(path, data["time_stamps"], "time of frame {row} is not after that of frame {before}")
     u = np.vstack([data["linear_velocity"], data["rotational_velocity"]]).T
-    if choice(rates, "rates", ("mean", "held")) == "mean":
+    if rates == "mean":
         u[:-1] = 0.5 * (u[:-1] + u[1:])
     seen = (y != -1).all(axis=0)
-    near = seen & (y[0] - y[2] >= low)
+    near = seen & (y[0] - y[2] >= min_disparity_px)
     if (left_out := int(np.count_nonzero(seen & ~near))) > 0:
-        request.leave_out(left_out, f"{path}: {left_out} observations with a disparity below {low:g} px")
+        request.leave_out(left_out, f"{path}: {left_out} observations with a disparity below {min_disparity_px:g} px")
     camera = K[0, 0], K[1, 1], K[0, 2], K[1, 2], data["b"]
     mount = frame(T[:3, 3], T[:3, :3].T)
     section = described(camera, (1242, 375), [0.5] * 4, mount, SIGMAS_OF_KITTI)
@@ -127,4 +132,4 @@ def read_kitti(path: Path, request: Request, min_disparity_px: Any = 1.0, rates:
 
 STARRY_NIGHT = Format("starry_night", f"{FILE} or its folder", partial(find_variables, FILE, STARRY), read_starry_night)
 KITTI_STEREO = Format("kitti_stereo_features", "an .npz file with features, time_stamps, ... or its folder", find_kitti,
-                      read_kitti, options=("min_disparity_px", "rates"))  # fmt: skip
+                      read_kitti)  # fmt: skip

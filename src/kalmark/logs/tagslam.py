@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, order, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
@@ -28,12 +29,10 @@ from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
     Format,
     Request,
-    choice,
     folder_of,
     mapping,
     nanoseconds,
     one_robot,
-    quantity,
     vector_frame,
 )
 from kalmark.logs.table_columns import CORNERS, INCREMENT3
@@ -336,26 +335,29 @@ def scans_of(
 
 
 def read(
-    path: Path, request: Request, tag_size_m: Any = None, cameras: Any = "all", odometry: Any = "auto",
-    sigma_px: Any = None,
-) -> Log:  # fmt: skip
-    """Return the log of a test.
-
-    `tag_size_m` is the size of the tags whose own size tagslam.yaml does not give (None: its default);
-    `cameras="given"` leaves out those without a pose in camera_poses.yaml; `odometry="none"` does without it;
-    `sigma_px` is the noise of a corner's coordinate (None: the `pixel_noise` of tagslam.yaml).
-    """
+    path: Path,
+    request: Request,
+    tag_size_m: Annotated[
+        float | None, Within(ge=1e-6), "Size of the tags that tagslam.yaml gives none of their own."
+    ] = None,
+    cameras: Annotated[Literal["all", "given"], "All, or those with a pose in camera_poses.yaml."] = "all",
+    odometry: Annotated[Literal["auto", "none"], "Use the odometry of the bag, if it has one."] = "auto",
+    sigma_px: Annotated[
+        float | None, Within(ge=1e-6), "Noise of a corner's coordinate; the pixel_noise of tagslam.yaml if absent."
+    ] = None,
+) -> Log:
+    """Return the log of a test."""
     scene = read_scene(path / "tagslam.yaml")
     if tag_size_m is not None:
-        scene.other_size = quantity(tag_size_m, "tag_size_m", 1e-6)
+        scene.other_size = tag_size_m
     if sigma_px is not None:
-        scene.pixel_noise = quantity(sigma_px, "sigma_px", 1e-6)
+        scene.pixel_noise = sigma_px
     bag = find_bag(path, "tag_detections")
     if bag is None:
         raise LogError(f"{path}: no tag_detections.bag or tag_detections.bag.bz2, expected one of them")
     known, poses = read_cameras(path)
     reference = read_reference(path, scene, rig_body(path, known))
-    guesses = reference.cameras if choice(cameras, "cameras", ("all", "given")) == "all" else {}
+    guesses = reference.cameras if cameras == "all" else {}
     sections = {}
     for name, camera in known.items():
         if name in poses or name in guesses:
@@ -367,7 +369,7 @@ def read(
     received = messages(bag)
     topics = {str(known[name]["tagtopic"]).lstrip("/"): name for name in sections}
     scans = scans_of(received, topics, scene, bag, request)
-    moved = read_odometry(scene, received) if choice(odometry, "odometry", ("auto", "none")) == "auto" else None
+    moved = read_odometry(scene, received) if odometry == "auto" else None
     scans = begin(path, scans, reference, moved, request)
     events: list[Event] = [*scans, *(controls(moved, scans) if moved else [])]
     rig = {"robots": {ROBOT: robot(sections, reference, scans, moved)}, "landmarks": {"type": "tag"}}
@@ -413,5 +415,4 @@ def robot(
     return {"motion": dict(MOTION), "start": start | VELOCITY, "sensors": sections}
 
 
-TAGSLAM = Format("tagslam", "a folder with tagslam.yaml, cameras.yaml and tag_detections.bag", find, read,
-                 options=("tag_size_m", "cameras", "odometry", "sigma_px"))  # fmt: skip
+TAGSLAM = Format("tagslam", "a folder with tagslam.yaml, cameras.yaml and tag_detections.bag", find, read)  # fmt: skip

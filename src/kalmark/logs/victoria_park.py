@@ -8,7 +8,7 @@ from __future__ import annotations
 import zipfile
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from kalmark.events import Control, Event, Scan
 from kalmark.files import refuse_bomb
 from kalmark.logs.array_files import arrays, times
 from kalmark.logs.log import Log, PositionTrack, Times
-from kalmark.logs.source import Format, Request, choice, folder_of, nanoseconds, one_robot, read_text, timed_rows
+from kalmark.logs.source import Format, Request, folder_of, nanoseconds, one_robot, read_text, timed_rows
 from kalmark.logs.table_columns import BEAM
 
 ROBOT, SENSOR = "car", "laser"
@@ -39,22 +39,23 @@ def find(path: Path) -> Path | None:
     return folder_of(path, (ASCII_ZIP, ASCII_DR, MAT_DR))
 
 
-def read(path: Path, request: Request, detections: Any = "slsjf", steering: Any = "ascii") -> Log:
+def read(
+    path: Path,
+    request: Request,
+    detections: Annotated[Literal["slsjf", "rfs", "laser"], "Which detections."] = "slsjf",
+    steering: Annotated[Literal["ascii", "mat"], "Which steering calibration."] = "ascii",
+) -> Log:
     """Return the log with detections, and the encoders' calibration `ascii` or `mat`.
 
     `slsjf`: trees of known identity; `rfs`: trees without, by range, bearing and radius; `laser`: the beams themselves.
     """
-    wanted = choice(detections, "detections", ("slsjf", "rfs", "laser"))
-    if choice(steering, "steering", ("ascii", "mat")) == "ascii":
-        events = ascii_controls(path, request)
-    else:
-        events = mat_controls(path / MAT_DR)
-    if wanted == "slsjf":
+    events = ascii_controls(path, request) if steering == "ascii" else mat_controls(path / MAT_DR)
+    if detections == "slsjf":
         events += slsjf_scans(path / SLSJF, request)
     else:
-        events += rfs_scans(path / RFS, request) if wanted == "rfs" else laser_scans(path)
+        events += rfs_scans(path / RFS, request) if detections == "rfs" else laser_scans(path)
     gps = {ROBOT: read_gps(path / GPS)} if (path / GPS).is_file() else {}
-    sensors = {SENSOR: BEAM + (("signature",) if wanted == "rfs" else ())}
+    sensors = {SENSOR: BEAM + (("signature",) if detections == "rfs" else ())}
     return one_robot("victoria_park", path, request, ROBOT, events, ("v_mps", "steering_rad"), sensors, gps=gps)
 
 
@@ -158,4 +159,4 @@ def milliseconds(values: Array, path: Path, name: str) -> Times:
 
 
 VICTORIA_PARK = Format("victoria_park", f"a folder with {ASCII_ZIP} or {MAT_DR}, and {SLSJF.as_posix()} or the zip's"
-                       " laser", find, read, options=("detections", "steering"))  # fmt: skip
+                       " laser", find, read)  # fmt: skip

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.declare import Values
 from kalmark.errors import EventError, LogError
 from kalmark.events import Control, Fix, Frame, Scan, order
 from kalmark.geometry import rotations
@@ -57,11 +58,16 @@ _AXES2, _AXES3 = [0, 1], [0, 1, 2]
 
 
 def read(
-    path: Path, request: Request, topics: Mapping[str, Any] | None = None, definitions: Mapping[str, str] | None = None
+    path: Path,
+    request: Request,
+    topics: Annotated[Any, Values("topic"), "Topics by name, and what each of them is in the log, see below."] = None,
+    definitions: Annotated[
+        Any,
+        Values(ending=".msg"),
+        "Types of messages that it does not define, each with its .msg file, or the text of one.",
+    ] = None,
 ) -> Log:
     """Return the log that these topics of a bag are; of a bag that kalmark wrote, the log itself.
-
-    `definitions` are those of types that the bag does not define: texts, or .msg files.
 
     Raises LogError: a topic that is not there, messages that do not offer what the topic is to be.
     """
@@ -414,5 +420,4 @@ def increment(a: Array, b: Array) -> Array:
     return np.array([c * x + s * y, c * y - s * x, wrap(b[2] - a[2])])
 
 
-BAG = Format("bag", "a ROS bag (.bag, .mcap, .db3, the folder of a ROS 2 bag), with log.topics", find_bag, read,
-             options=("topics", "definitions"))  # fmt: skip
+BAG = Format("bag", "a ROS bag (.bag, .mcap, .db3, the folder of a ROS 2 bag), with log.topics", find_bag, read)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.images.image_files import frames_of
 from kalmark.logs.images.rigs import MOTION, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Times, Trajectory, interpolate
-from kalmark.logs.source import Format, Request, choice, nearest, number, read_text
+from kalmark.logs.source import Format, Request, nearest, number, read_text
 from kalmark.logs.table_columns import INERTIAL, TWIST3
 from kalmark.models.motion import shaken
 
@@ -51,16 +51,20 @@ def find(path: Path) -> Path | None:
     return next((f for f in (path, path / "mav0") if (f / "cam0" / "data.csv").is_file()), None)
 
 
-def read(path: Path, request: Request, cameras: Any = ("cam0",), imu: Any = "auto") -> Log:
-    """Return the log of these cameras; `imu` "none" leaves the inertial unit out.  Raises LogError."""
+def read(
+    path: Path,
+    request: Request,
+    cameras: Annotated[tuple[str, ...], "The cameras, by the names of their folders."] = ("cam0",),
+    imu: Annotated[Literal["auto", "none"], "Let the inertial unit move the robot, if there is one."] = "auto",
+) -> Log:
+    """Return the log of these cameras.  Raises LogError."""
     there = sorted(folder.name for folder in path.glob("cam*") if (folder / "data.csv").is_file())
-    asked = [cameras] if isinstance(cameras, str) else [*cameras]
-    for name in asked:
+    for name in cameras:
         if name not in there:
             raise LogError(f"{path}: no camera {shown(name)}, expected {', '.join(there)}{nearest(str(name), there)}")
     frames: list[Frame] = []
     sections: dict[str, Any] = {}
-    for name in asked:
+    for name in cameras:
         listed = image_list(path / name)
         taken = frames_of(ROBOT, name, [*listed], [*listed.values()], request)
         calibration = read_calibration(path / name / "sensor.yaml")
@@ -68,7 +72,7 @@ def read(path: Path, request: Request, cameras: Any = ("cam0",), imu: Any = "aut
     begin, end = (pick(frame.t_ns for frame in frames) for pick in (min, max))
     states = true_states(path)
     truth = {} if states is None else {ROBOT: Trajectory(states.t_ns, states.rows[:, :7])}
-    readings = csv_of(path / "imu0" / "data.csv", 7) if choice(imu, "imu", ("auto", "none")) == "auto" else None
+    readings = csv_of(path / "imu0" / "data.csv", 7) if imu == "auto" else None
     name = (path.resolve().parent if path.name == "mav0" else path).name
     if readings is None:
         return camera_log("euroc", path, request, frames, sections, MOTION, name=name, truth=truth)
@@ -192,6 +196,4 @@ def data_sheet(file: Path) -> dict[str, float]:
         raise LogError(f"{file}: {error}, expected numbers for {', '.join(NAMES)}") from None
 
 
-EUROC = Format(
-    "euroc", "a folder mav0 with cam0/data.csv of EuRoC", find, read, options=("cameras", "imu"), describes_all=True
-)
+EUROC = Format("euroc", "a folder mav0 with cam0/data.csv of EuRoC", find, read, describes_all=True)

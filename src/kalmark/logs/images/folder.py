@@ -11,17 +11,18 @@ from __future__ import annotations
 import re
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
+from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.events import Frame, shown
 from kalmark.logs.images.image_files import ENDINGS, Forward, frames_of, video_facts, video_images
 from kalmark.logs.images.rigs import CAMERA, ROBOT, calibration_beside, camera, camera_log, no_times
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows, read_path
-from kalmark.logs.source import Format, Request, frame, nanoseconds, number, quantity, rows
+from kalmark.logs.source import Format, Request, frame, nanoseconds, number, rows
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ogv")
 TIMES = "times.txt"
@@ -48,8 +49,11 @@ def find(path: Path) -> Path | None:
     return inside[0] if len(inside) == 1 else None
 
 
-def read(path: Path, request: Request, fps: Any = None) -> Log:
-    """Return the log of a folder of images; `fps` is their rate [Hz] where they have no times.  Raises LogError."""
+Rate = Annotated[float | None, Within(ge=1e-3), "Images a second, where they have no times, or others."]
+
+
+def read(path: Path, request: Request, fps: Rate = None) -> Log:
+    """Return the log of a folder of images.  Raises LogError."""
     files = images_in(path)
     t_ns = times_of(path, files, fps)
     frames = frames_of(ROBOT, CAMERA, t_ns, files, request)
@@ -64,10 +68,10 @@ def find_video(path: Path) -> Path | None:
     return path if path.suffix.lower() in VIDEOS else None
 
 
-def read_video(path: Path, request: Request, fps: Any = None) -> Log:
-    """Return the log of a video; `fps` is its rate [Hz] instead of the one that it says.  Raises LogError."""
+def read_video(path: Path, request: Request, fps: Rate = None) -> Log:
+    """Return the log of a video.  Raises LogError."""
     count, rate = video_facts(path)
-    rate = rate if fps is None else quantity(fps, "fps", 1e-3)
+    rate = rate if fps is None else fps
     if not rate:
         raise LogError(f"{path}: the video has no rate, expected log.fps (Hz)")
     images = Forward(partial(video_images, path))
@@ -86,12 +90,11 @@ def _log(format: str, path: Path, request: Request, frames: list[Frame], t_ns: l
     return camera_log(format, path, request, frames, {CAMERA: camera(frames, known)}, name=path.stem, truth=truth)
 
 
-def times_of(path: Path, files: list[Path], fps: Any) -> list[int]:
+def times_of(path: Path, files: list[Path], fps: float | None) -> list[int]:
     """Return the times (ns) of images, which increase.  Raises LogError."""
     beside = next((place / TIMES for place in (path, path.parent) if (place / TIMES).is_file()), None)
     if fps is not None:
-        rate = quantity(fps, "fps", 1e-3)
-        return [round(k * 1e9 / rate) for k in range(len(files))]
+        return [round(k * 1e9 / fps) for k in range(len(files))]
     if beside is not None:
         return read_times(beside, len(files))
     found = [named_time(file.stem) for file in files]
@@ -151,5 +154,5 @@ def true_path(file: Path, t_ns: list[int], request: Request) -> Trajectory:
     return Trajectory(np.array(t_ns), np.array(poses))
 
 
-IMAGES = Format("images", "a folder of images", find, read, options=("fps",), describes_all=True)
-VIDEO = Format("video", "a video", find_video, read_video, options=("fps",), describes_all=True)
+IMAGES = Format("images", "a folder of images", find, read, describes_all=True)
+VIDEO = Format("video", "a video", find_video, read_video, describes_all=True)

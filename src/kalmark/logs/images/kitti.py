@@ -7,7 +7,7 @@ the images of the right one, `image_1`, it is a rectified pair (`stereo`).  Of c
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from kalmark.logs.images.image_files import frames_of
 from kalmark.logs.images.rigs import CAMERA, ROBOT, camera, camera_log
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows
-from kalmark.logs.source import Format, Request, choice, number, rows
+from kalmark.logs.source import Format, Request, number, rows
 
 FOLDERS = "image_0", "image_2"  # of the left grey and the left colour camera
 CALIBRATION = "calib.txt"
@@ -30,12 +30,16 @@ def find(path: Path) -> Path | None:
     return path if there and (path / TIMES).is_file() and (path / CALIBRATION).is_file() else None
 
 
-def read(path: Path, request: Request, right: Any = "auto") -> Log:
-    """Return the log; `right` "none" leaves the images of the right camera out.  Raises LogError."""
+def read(
+    path: Path,
+    request: Request,
+    right: Annotated[Literal["auto", "none"], "Take the images of the right camera, if there are any."] = "auto",
+) -> Log:
+    """Return the log.  Raises LogError."""
     folder = next(path / name for name in FOLDERS if (path / name).is_dir())
     files, other = images_in(folder), path / f"image_{int(folder.name[-1]) + 1}"
     t_ns = read_times(path / TIMES, len(files))
-    pair = choice(right, "right", ("auto", "none")) == "auto" and other.is_dir()
+    pair = right == "auto" and other.is_dir()
     rights = [other / file.name for file in files] if pair else [None] * len(files)
     frames = frames_of(ROBOT, CAMERA, t_ns, files, request, rights=rights)
     own, shared = path / "poses.txt", path.resolve().parent.parent / "poses" / f"{path.resolve().name}.txt"
@@ -74,4 +78,4 @@ def projection(file: Path, name: str) -> tuple[dict[str, Any], float]:
 
 
 KITTI_ODOMETRY = Format("kitti_odometry", "a sequence of KITTI's odometry benchmark with image_0, times.txt and "
-                        "calib.txt", find, read, options=("right",), describes_all=True)  # fmt: skip
+                        "calib.txt", find, read, describes_all=True)  # fmt: skip

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.events import shown
 from kalmark.logs.images.image_files import DEPTH_SCALE, frames_of
 from kalmark.logs.images.rigs import CAMERA, ROBOT, calibration_beside, camera, camera_log
 from kalmark.logs.log import Log
 from kalmark.logs.poses import read_path
-from kalmark.logs.source import Format, Request, choice, nanoseconds, quantity, rows
+from kalmark.logs.source import Format, Request, nanoseconds, rows
 
 NEAR_NS = 20_000_000
 SIZE = {"width_px": 640, "height_px": 480}
@@ -36,14 +37,18 @@ def find(path: Path) -> Path | None:
     return folder if (path.is_dir() or path.name == "rgb.txt") and (folder / "rgb.txt").is_file() else None
 
 
-def read(path: Path, request: Request, depth: Any = "auto", depth_scale: Any = DEPTH_SCALE) -> Log:
-    """Return the log; `depth` "none" leaves the depths out, `depth_scale` is the number of 1 m.  Raises LogError."""
+def read(
+    path: Path,
+    request: Request,
+    depth: Annotated[Literal["auto", "none"], "Take the depth images, if there are any."] = "auto",
+    depth_scale: Annotated[float, Within(ge=1e-3), "The number of 1 m in a depth image."] = DEPTH_SCALE,
+) -> Log:
+    """Return the log.  Raises LogError."""
     listed = read_list(path / "rgb.txt")
     depths: dict[int, Path] = {}
-    if choice(depth, "depth", ("auto", "none")) == "auto" and (path / "depth.txt").is_file():
+    if depth == "auto" and (path / "depth.txt").is_file():
         depths = nearest([*listed], read_list(path / "depth.txt"))
-    scale = quantity(depth_scale, "depth_scale", 1e-3)
-    frames = frames_of(ROBOT, CAMERA, [*listed], [*listed.values()], request, [*map(depths.get, listed)], scale)
+    frames = frames_of(ROBOT, CAMERA, [*listed], [*listed.values()], request, [*map(depths.get, listed)], depth_scale)
     poses = path / "groundtruth.txt"
     truth = {ROBOT: read_path(poses, request)} if poses.is_file() else {}
     section = camera(frames, calibration_beside(path) or published(path.resolve().name))
@@ -97,6 +102,4 @@ def nearest(t_ns: list[int], others: dict[int, Path]) -> dict[int, Path]:
     return found
 
 
-TUM_RGBD = Format(
-    "tum_rgbd", "a folder with rgb.txt of TUM RGB-D", find, read, options=("depth", "depth_scale"), describes_all=True
-)
+TUM_RGBD = Format("tum_rgbd", "a folder with rgb.txt of TUM RGB-D", find, read, describes_all=True)
