@@ -56,7 +56,11 @@ _FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
 SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` calls them
     "models": ("compiled.py", "geometry/*.py", "models/*.py"),
     "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py"),
-    "campaign": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py", "campaign/engine.py"),
+    "results": ("compiled.py", "geometry/*.py", "filter/kernels.py", "results/measures.py"),
+    "campaign": (
+        *("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py", "results/measures.py"),
+        "campaign/engine.py",
+    ),
 }
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from kalmark.campaign.campaign import Anees, figures
-from kalmark.campaign.scoring import SERIES, Scores, joint_nees
-from kalmark.results.measures import anees_interval, nees
+from kalmark.campaign.scoring import SERIES, Scores
+from kalmark.results.measures import anees_interval
 
 STEPS = 2000
 
@@ -73,16 +73,6 @@ def test_divergences_are_counted_and_their_reasons_kept() -> None:
     f = figures([scores(rng), scores(rng, diverged=True), scores(rng, diverged=True)])
     assert (f["runs"], f["diverged"]) == (3, 2)
     assert "stopped" not in f
-
-
-def test_the_joint_nees_is_the_quadratic_form_and_nothing_for_a_singular_covariance() -> None:
-    rng = np.random.default_rng(2)
-    A = rng.standard_normal((6, 6)) * np.logspace(-4, 3, 6)[:, None]
-    d = rng.standard_normal((2, 6)) * np.logspace(-4, 3, 6)
-    assert joint_nees(d, A @ A.T) == pytest.approx(nees(d, np.broadcast_to(A @ A.T, (2, 6, 6))), rel=1e-6)
-    A[3] = A[1] + A[2]
-    assert np.isnan(joint_nees(d, A @ A.T)).all()
-    assert np.isnan(joint_nees(d, np.zeros((6, 6)))).all()
 
 
 def test_the_standard_error_of_the_anees_is_that_of_runs_not_of_steps() -> None:

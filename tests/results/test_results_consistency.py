@@ -10,7 +10,7 @@ from kalmark.geometry import V, V_inverse
 from kalmark.results.measures import (
     anees_interval,
     diverged,
-    left_jacobian_inverse,
+    map_nees,
     most_nees,
     nees,
     nis,
@@ -19,10 +19,10 @@ from kalmark.results.measures import (
 )
 
 
-def test_the_inverse_of_V_for_many_angles_at_once_is_that_for_one() -> None:
-    angles = np.array([1e-9, -1e-5, 1.9e-4, 2.1e-4, 0.3, -2.5, 3.1])
-    assert np.allclose(left_jacobian_inverse(angles), [V_inverse(a) for a in angles], atol=1e-9)
-    assert np.allclose(left_jacobian_inverse(np.zeros(3)), np.eye(2))
+def test_log_coordinates_of_many_angles_at_once_are_those_of_each() -> None:
+    angles, d = np.array([0.0, 1e-9, -1e-5, 1.9e-4, 2.1e-4, 0.3, -2.5, 3.1]), np.array([0.4, -0.7])
+    expected = [V_inverse(a) @ d for a in angles]
+    np.testing.assert_allclose(point_error(np.zeros((8, 2)), np.tile(d, (8, 1)), angles, "log"), expected, atol=1e-14)
 
 
 def test_log_coordinates_undo_the_retraction_of_the_invariant_filter() -> None:
@@ -58,6 +58,20 @@ def test_singular_covariances_are_left_out_whatever_their_scale() -> None:
     values = nees(d, P)
     assert np.isnan(values[[0, 1, 3]]).all()
     assert values[2] == pytest.approx(3e14)
+
+
+def test_the_nees_of_a_map_is_that_of_its_blocks_and_of_all_and_nothing_for_a_singular_covariance() -> None:
+    rng, n, first, sizes = np.random.default_rng(2), 14, np.array([3, 5, 11]), np.array([2, 6, 3])
+    A = rng.standard_normal((n, n)) * np.logspace(-2, 2, n)[:, None]
+    d, P = rng.standard_normal((2, n)) * np.logspace(-2, 2, n), A @ A.T
+    blocks = [(d[:, i : i + m], P[i : i + m, i : i + m]) for i, m in [*zip(first, sizes, strict=True), (0, n)]]
+    each = np.array([np.einsum("ci,ci->c", e, np.linalg.solve(S, e.T).T) for e, S in blocks])
+    expected = [*each[:3].mean(axis=0), 11 / 3, *each[3], n]
+    np.testing.assert_allclose(map_nees(d, P, first, sizes), expected, rtol=1e-6)
+    A[4] = 2.0 * A[3]  # the first block, hence all
+    np.testing.assert_allclose(map_nees(d, A @ A.T, first, sizes)[:3], [*each[1:3].mean(axis=0), 4.5], rtol=1e-6)
+    assert np.isnan(map_nees(d, A @ A.T, first, sizes)[3:]).all()
+    assert np.isnan(map_nees(d, np.zeros((n, n)), first, sizes)).all()
 
 
 def test_nis_counts_only_the_rows_that_a_sensor_has() -> None:

@@ -35,7 +35,7 @@ from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
 from kalmark.models.observe import call_move, step_of
 from kalmark.models.protocols import calibrating, parameter_covariance
 from kalmark.models.sensors import RangeBearing
-from kalmark.results.measures import SINGULAR, nees
+from kalmark.results.measures import MAP_NEES, in_log, map_nees
 from kalmark.simulate.robots import Chance, drawn_start, scenery_of
 from kalmark.simulate.routes import Constant, Drive
 from kalmark.simulate.sights import POINTS, Sensing, Things, chosen
@@ -44,7 +44,6 @@ from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
 
 MOTIONS = (Unicycle, Odometry2D, Ackermann)
-REGULAR = 1e-6  # determinant of a correlation matrix above which the compiled NEES is as exact as LAPACK's
 ALL_TARGETS = 100  # places to drive to, a step, before a run is left to the ordinary path
 
 NO_CONTROL = np.zeros(0)  # the noise of controls does not depend on them
@@ -346,10 +345,10 @@ def filtered(
     `ways` are the addresses of the prediction, the correction and the generator, `tables` the blocks and the atoms of a
     robot and all landmarks and the capacity of a covariance, `controls` u (steps, m), seconds (steps,), the covariance
     N of a control's error, the diffusion (3 or 0, .) a second and whether controls are held, `sensed` the mount and
-    its noise, `rules` the gate and the limits of the iterations, `scored` what `score_map` takes.
+    its noise, `rules` the gate and the limits of the iterations, `scored` `map_every` and what `score_map` takes.
 
     Returns whether all went well, the pose (steps, 3) after each scan and its covariance, the scores of the map
-    (steps, 5), the mean in the end, the numbers of the landmarks in it, the sum of d2 and how many were fused.
+    (steps, 6), the mean in the end, the numbers of the landmarks in it, the sum of d2 and how many were fused.
     """
     blocks, atoms, capacity = tables
     u, dt_s, N, density, held = controls
@@ -360,7 +359,7 @@ def filtered(
     x, x_first, P = np.zeros(capacity), np.zeros(capacity), np.zeros((capacity, capacity))
     x[:3] = x_first[:3] = started[0]
     P[:3, :3] = started[1]
-    mean, cov, scores = np.full((steps, 3), np.nan), np.full((steps, 3, 3), np.nan), np.full((steps, 5), np.nan)
+    mean, cov, scores = np.full((steps, 3), np.nan), np.full((steps, 3, 3), np.nan), np.full((steps, 6), np.nan)
     slot_of, order = np.full(len(blocks), -1), np.empty(len(blocks), np.int64)
     none, nothing, count, nis, fused, ok = np.empty(0, np.int64), np.zeros((0, 0)), 0, 0.0, 0, True
     for k in range(steps):
@@ -389,7 +388,7 @@ def filtered(
         if high > low:
             keep_pose(x, P, mean[k], cov[k])
             if (k + 1) % scored[0] == 0 or k == steps - 1:
-                score_map(x, P, order[:count], scored[1], scored[2][k + 1], scored[3], scores[k])
+                scores[k] = score_map(x, P, order[:count], scored[1], scored[2][k + 1], scored[3])
     return ok, mean, cov, scores, x, order[:count], nis, fused
 
 
@@ -404,111 +403,19 @@ def keep_pose(x: Array, P: Array, mean: Array, cov: Array) -> None:
 
 
 @compiled
-def score_map(
-    x: Array, P: Array, order: Index, turns: bool, truth: Array, points: Array, out: Array
-) -> None:  # fmt: skip
-    """Write the NEES of the landmarks (mean) and of the joint state, each in own and in world coordinates, and n.
+def score_map(x: Array, P: Array, order: Index, turns: bool, truth: Array, points: Array) -> Array:
+    """Return the NEES of the map (6,), as `map_nees`.
 
     `turns`: errors are in the invariant filter's coordinates.  `truth` is the true state (3,) of the robot, `points`
     where the landmarks truly are.
     """
-    n, a = 3 + 2 * len(order), wrap(truth[2] - x[2])
-    half = 0.5 * a
-    diagonal = 1.0 - half * half / 3.0 if abs(half) < 1e-4 else half / math.tan(half)
-    sums, finite, d = np.zeros(2), np.zeros(2), np.empty((2, n))
-    for i in range(len(order) + 1):
-        j = 0 if i == 0 else 2 * i + 1
-        d[1, j] = (truth[0] if i == 0 else points[order[i - 1], 0]) - x[j]
-        d[1, j + 1] = (truth[1] if i == 0 else points[order[i - 1], 1]) - x[j + 1]
-        d[0, j], d[0, j + 1] = d[1, j], d[1, j + 1]
-        if turns:
-            d[0, j], d[0, j + 1] = diagonal * d[1, j] + half * d[1, j + 1], diagonal * d[1, j + 1] - half * d[1, j]
-        for c in range(2 if i > 0 else 0):
-            value = nees_of_two(d[c, j], d[c, j + 1], P[j, j], P[j + 1, j], P[j + 1, j + 1])
-            if np.isfinite(value):
-                sums[c] += value
-                finite[c] += 1.0
+    a, d = wrap(truth[2] - x[2]), np.empty((2, 3 + 2 * len(order)))
     d[0, 2] = d[1, 2] = a
-    for c in range(2):
-        if finite[c] > 0.0:
-            out[c] = sums[c] / finite[c]
-    joint, joint_world = joint_nees(P, d)
-    out[2], out[3] = joint, joint_world
-    if np.isfinite(joint):
-        out[4] = float(n)
-
-
-@compiled
-def nees_of_two(d_x: float, d_y: float, xx: float, yx: float, yy: float) -> float:
-    """Return the NEES of an error (2,) whose covariance has these numbers; NaN if it is singular."""
-    if not (xx > 0.0 and yy > 0.0):
-        return np.nan
-    s_x, s_y = math.sqrt(xx), math.sqrt(yy)
-    r, a, b = yx / (s_x * s_y), d_x / s_x, d_y / s_y
-    if not 1.0 - abs(r) > SINGULAR:
-        return np.nan
-    b -= r * a
-    return a * a + b * b / ((1.0 - r) * (1.0 + r))
-
-
-@compiled
-def joint_nees(P: Array, d: Array) -> tuple[float, float]:
-    """Return the NEES of two errors d (2, n) of one state with the lower triangle P; NaN if it is singular.
-
-    By the Cholesky factor of the correlation with both scaled errors as two more rows: there it has L^-1 d.
-    """
-    n = d.shape[1]
-    S, sigma = np.zeros((n + 2, n + 2)), np.empty(n)
-    for i in range(n):
-        sigma[i] = math.sqrt(P[i, i])
-        for j in range(i + 1):
-            S[i, j] = P[i, j] / (sigma[i] * sigma[j])
-        for c in range(2):
-            S[n + c, i] = d[c, i] / sigma[i]
-    S[n, n] = S[n + 1, n + 1] = 1e300
-    if not kernels.cholesky(S):
-        return np.nan, np.nan
-    value = np.zeros(2)
-    for i in range(n):
-        if not S[i, i] ** 2 > SINGULAR:
-            return np.nan, np.nan
-        for c in range(2):
-            value[c] += S[n + c, i] ** 2
-    return value[0], value[1]
-
-
-@compiled
-def small_nees(d: Array, P: Array) -> tuple[Array, Array]:
-    """Return the NEES (N,) of errors d (N, n) with covariances P (N, n, n), n up to 3, and how regular these are."""
-    count, n = d.shape
-    value, determinant, L, w = np.zeros(count), np.zeros(count), np.zeros((n, n)), np.empty(n)
-    for k in range(count):
-        product = 1.0
-        for i in range(n):
-            w[i] = d[k, i] / math.sqrt(P[k, i, i])
-            for j in range(i + 1):
-                s = P[k, i, j] / math.sqrt(P[k, i, i] * P[k, j, j])
-                for a in range(j):
-                    s -= L[i, a] * L[j, a]
-                L[i, j] = math.sqrt(s) if i == j else s / L[j, j]
-            for j in range(i):
-                w[i] -= L[i, j] * w[j]
-            product *= L[i, i] ** 2
-            w[i] /= L[i, i]
-            value[k] += w[i] ** 2
-        determinant[k] = product
-    return value, determinant
-
-
-def fast_nees(d: Array, P: Array) -> Array:
-    """Return what `measures.nees` does: compiled where that is as exact."""
-    n = d.shape[-1]
-    rows, blocks = np.ascontiguousarray(d.reshape(-1, n)), np.ascontiguousarray(P.reshape(-1, n, n))
-    value, determinant = small_nees(rows, blocks)
-    odd = ~(determinant > REGULAR)
-    if odd.any():
-        value[odd] = nees(rows[odd], blocks[odd])
-    return value.reshape(d.shape[:-1])
+    for i in range(len(order) + 1):
+        j, true = (2 * i + 1, points[order[i - 1]]) if i else (0, truth[:2])
+        d[1, j], d[1, j + 1] = true[0] - x[j], true[1] - x[j + 1]
+        d[0, j], d[0, j + 1] = in_log(a if turns else 0.0, d[1, j], d[1, j + 1])
+    return map_nees(d, P, 3 + 2 * np.arange(len(order)), np.full(len(order), 2))
 
 
 # ---------------------------------------------------------------------- runs
@@ -641,11 +548,8 @@ class Engine:
         if not ok:
             return None
         series = {key: np.full((1, len(u)), np.nan) for key in SERIES}
-        for i, key in enumerate(("landmarks", "landmarks_world", "joint", "joint_world", "joint_dof")):
+        for i, key in enumerate(MAP_NEES):
             series[key][0] = of_map[:, i]
-        series["landmarks_dof"][0] = np.where(np.isfinite(of_map[:, 0]), 2.0, np.nan)
         place = x[3 : 3 + 2 * len(order)].reshape(-1, 2)
         found = place, points[order], len(order), len(order)
-        return scores_of(
-            series, mean[None], P[None], states[None, 1:], f.coordinates, found, nis, 2 * fused, "", fast_nees
-        )
+        return scores_of(series, mean[None], P[None], states[None, 1:], f.coordinates, found, nis, 2 * fused, "")

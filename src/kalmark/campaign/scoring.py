@@ -13,7 +13,7 @@ tag      its pose                                                              6
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -28,7 +28,17 @@ from kalmark.geometry.spaces import POINT2, POINT3
 from kalmark.models.landmarks import Polar2D
 from kalmark.models.protocols import Pointed, Segmented, place_of
 from kalmark.report import Report
-from kalmark.results.measures import SINGULAR, diverged, nees, point_error, pose_error, rigid, rmse, rotation_error
+from kalmark.results.measures import (
+    MAP_NEES,
+    aligned_rmse,
+    diverged,
+    map_nees,
+    nees,
+    point_error,
+    pose_error,
+    rmse,
+    rotation_error,
+)
 from kalmark.simulate.robots import Simulation
 from kalmark.slam.slam import Slam
 
@@ -262,11 +272,11 @@ class _Scorer:
         judged |= mounts | landmarks
         F = on_diagonal([j.F for j in judged.values()])
         P = F @ slam.covariance(*judged) @ F.T
-        self._score_landmarks(list(landmarks.values()), P, row, k)
         d = np.array([np.concatenate([getattr(j, c) for j in judged.values()]) for c in ("own", "world")])
-        series = self.series
-        series["joint"][row, k], series["joint_world"][row, k] = joint_nees(d, P)
-        series["joint_dof"][row, k] = len(P) if np.isfinite(series["joint"][row, k]) else np.nan
+        sizes = np.array([len(j.own) for j in landmarks.values()], dtype=np.int64)
+        first = len(P) - sizes.sum() + np.cumsum(sizes) - sizes
+        for key, value in zip(MAP_NEES, map_nees(d, P, first, sizes).tolist(), strict=True):
+            self.series[key][row, k] = value
 
     def _landmarks(self, turn: Any, eye: Array) -> Iterator[tuple[Id, Judged]]:
         """Yield the landmarks that have a truth, and whose depth is known well enough."""
@@ -285,26 +295,6 @@ class _Scorer:
             own, world = (point_error(place, truth, turn, c) for c in (coordinates, "world"))
             for i, name in enumerate(points):
                 yield name, Judged(own[i], world[i], np.eye(self.d), place[i : i + 1], truth[i : i + 1])
-
-    def _score_landmarks(self, landmarks: list[Judged], P: Array, row: int, k: int) -> None:
-        """Score landmarks by the last blocks of a covariance P (n, n)."""
-        values: dict[str, list[Array]] = {"": [], "_world": [], "_dof": []}
-        sizes = np.array([len(j.own) for j in landmarks], dtype=np.int64)
-        first = len(P) - sizes.sum() + np.cumsum(sizes) - sizes
-        for size in np.unique(sizes):
-            same = np.flatnonzero(sizes == size)
-            index = first[same][:, None] + np.arange(size)
-            own, world = (
-                nees(np.array([getattr(landmarks[i], c) for i in same]), P[index[:, :, None], index[:, None, :]])
-                for c in ("own", "world")
-            )
-            values[""].append(own)
-            values["_world"].append(world)
-            values["_dof"].append(np.where(np.isfinite(own), float(size), np.nan))
-        for name, parts in values.items():
-            numbers = np.concatenate([np.empty(0), *parts])
-            if np.isfinite(numbers).any():
-                self.series["landmarks" + name][row, k] = np.nanmean(numbers)
 
     def _score_mounts(self, errors: dict[str, Array], row: int, k: int) -> None:
         """Score mounts by their errors d (3|6,); a coordinate that is known exactly has no sigma to compare with."""
@@ -336,7 +326,6 @@ class _Scorer:
 def scores_of(
     series: dict[str, Array], mean: Array, P: Array, truth: Array, coordinates: str,
     found: tuple[Array, Array, int, int], nis: float, nis_dof: int, stopped: str,
-    nees: Callable[[Array, Array], Array] = nees,
 ) -> Scores:  # fmt: skip
     """Return the scores of a run: `series` has those of the map, those of the poses are added.
 
@@ -352,9 +341,9 @@ def scores_of(
         series[f"{name}_dof"] = np.where(np.isfinite(series[name]), float(size), np.nan)
     series["position_m"], series["heading_rad"] = (np.linalg.norm(e, axis=-1) for e in (world[..., :d], world[..., d:]))
     place, true, judged, count = found
-    aligned = rmse(rigid(place, true)(place) - true) if judged >= d else float("nan")
+    aligned = aligned_rmse(place, true) if judged >= d else float("nan")
     parts = zip(own[..., :d], P[..., :d, :d], series["position_m"], truth[..., :d], strict=True)
-    lost = any(diverged(e, P_e, error_m, path, nees) for e, P_e, error_m, path in parts)
+    lost = any(diverged(*part) for part in parts)
     return Scores(series, aligned, rmse(place - true), count, nis, nis_dof, lost or bool(stopped), stopped)
 
 
@@ -365,17 +354,3 @@ def on_diagonal(blocks: list[Array]) -> Array:
         F[i : i + block.shape[0], j : j + block.shape[1]] = block
         i, j = i + block.shape[0], j + block.shape[1]
     return F
-
-
-def joint_nees(d: Array, P: Array) -> Any:
-    """Return the NEES (E,) of E errors d (E, n) of one state with covariance P (n, n); NaN if P is singular."""
-    sigma = np.sqrt(np.diagonal(P))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        correlation = P / np.outer(sigma, sigma)
-    try:
-        L = np.linalg.cholesky(correlation)
-    except np.linalg.LinAlgError:
-        return np.full(len(d), np.nan)
-    if not (np.isfinite(L).all() and np.diagonal(L).min() ** 2 > SINGULAR):
-        return np.full(len(d), np.nan)
-    return np.sum(np.linalg.solve(L, (d / sigma).T) ** 2, axis=0)

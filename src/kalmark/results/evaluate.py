@@ -19,6 +19,7 @@ from kalmark.results.history import History, Ints
 from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks
 from kalmark.results.measures import (
     Rigid,
+    aligned_rmse,
     diverged,
     identity,
     most_nees,
@@ -26,7 +27,6 @@ from kalmark.results.measures import (
     nis,
     path_m,
     pose_error,
-    rigid,
     rigid_robust,
     rmse,
     similarity,
@@ -185,7 +185,7 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
     own = pose_error(mean, truth, coordinates)
     error_m = np.linalg.norm(world[:, :d], axis=1)
     return {
-        "ate_m": rmse(rigid(mean[:, :d], truth[:, :d])(mean[:, :d]) - truth[:, :d]),
+        "ate_m": aligned_rmse(mean[:, :d], truth[:, :d]),
         "ate_raw_m": rmse(world[:, :d]),
         "heading_rmse_deg": float(np.degrees(rmse(world[:, d:]))),
         "pose_nees": _mean(nees(own, P)),
@@ -271,7 +271,7 @@ def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
     position = np.array([true[str(landmarks.ids[k])][:d] for k in rows]).reshape(-1, d)
     enough = len(rows) >= d
     return {
-        "landmark_rmse_m": rmse(rigid(estimate, position)(estimate) - position) if enough else float("nan"),
+        "landmark_rmse_m": aligned_rmse(estimate, position) if enough else float("nan"),
         "landmark_rmse_raw_m": rmse(estimate - position),
         "landmarks_compared": len(rows),
     }

@@ -9,19 +9,23 @@ an orientation is the rotation vector in the world's frame that turns the estima
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtr
 
-from kalmark.arrays import Array
-from kalmark.geometry.angles import wrap
+from kalmark.arrays import Array, Index
+from kalmark.compiled import compiled
+from kalmark.filter import kernels
+from kalmark.geometry.angles import exponential_v, wrap
 from kalmark.geometry.gaussian import quantile
-from kalmark.geometry.rotations import from_matrix, multiply
+from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inverse, log, multiply
 from kalmark.results.history import Ints
 
-SINGULAR = 1e-12  # smallest eigenvalue of a correlation matrix that still counts as regular
+SINGULAR = 1e-12  # a pivot of a correlation matrix up to which it counts as singular
+FEW = 8  # numbers of an error up to which a Cholesky factor takes less time without LAPACK
+MAP_NEES = ("landmarks", "landmarks_world", "landmarks_dof", "joint", "joint_world", "joint_dof")
+"""The NEES of landmarks (the mean) and of the joint state, in own and in world coordinates, and degrees of freedom."""
 TINY = 1e-300
 CONSISTENT, ALONE = 0.9999, 0.97  # of good runs, of single values: above them a NEES is worth a warning
 DIVERGED_SIGMAS = 10.0
@@ -123,41 +127,59 @@ def rmse(errors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else float("nan")
 
 
+def aligned_rmse(estimate: Array, truth: Array) -> float:
+    """Return the RMSE of positions (N, d) after the rigid alignment that makes it least."""
+    return rmse(rigid(estimate, truth)(estimate) - truth)
+
+
 def path_m(positions: Array) -> float:
     """Return the length of a path of positions (N, d) in metres."""
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
 
 
-def left_jacobian_inverse(a: Any) -> Array:
-    """Return V(a)^-1 (..., 2, 2) for angles a (...), with V(a) = [[sin a, -(1-cos a)], [1-cos a, sin a]] / a."""
-    half = 0.5 * np.asarray(a, dtype=np.float64)
-    small = np.abs(half) < 1e-4
-    safe = np.where(small, 1.0, half)
-    diagonal = np.where(small, 1.0 - half**2 / 3.0, safe / np.tan(safe))
-    return np.stack([np.stack([diagonal, half], -1), np.stack([-half, diagonal], -1)], -2)
+@compiled
+def in_log(turn: float, x: float, y: float) -> tuple[float, float]:
+    """Return V(turn)^-1 (x, y) in the plane."""
+    p, q = exponential_v(turn)
+    square = p * p + q * q
+    return (p * x + q * y) / square, (p * y - q * x) / square
 
 
-def turned_back(turn: Array, d: Array) -> Array:
-    """Return V(turn)^-1 d (..., 3) for rotation vectors (..., 3), V the left Jacobian of SO(3), angles up to pi."""
-    half = 0.5 * np.linalg.norm(turn, axis=-1, keepdims=True)
-    small = half < 1e-2
-    safe = np.where(small, 1.0, half)
-    series = 1 / 12 + half**2 * (1 / 180 + half**2 / 1890)
-    q = np.where(small, series, (1.0 - safe / np.tan(safe)) / (4.0 * safe**2))
-    once = np.cross(turn, d)
-    return d - 0.5 * once + q * np.cross(turn, once)
+@compiled
+def all_in_log(turn: Array, d: Array) -> Array:
+    """Return V(turn)^-1 d (N, 2 or 3) of errors d with turns (N, 1 or 3): angles, or rotation vectors up to pi."""
+    out = np.empty_like(d)
+    for i in range(len(d)):
+        if d.shape[1] == 2:
+            out[i, 0], out[i, 1] = in_log(turn[i, 0], d[i, 0], d[i, 1])
+        else:
+            inverse = left_jacobian_inverse(turn[i])
+            for j in range(3):
+                out[i, j] = inverse[j, 0] * d[i, 0] + inverse[j, 1] * d[i, 1] + inverse[j, 2] * d[i, 2]
+    return out
+
+
+@compiled
+def rotations_between(mean: Array, truth: Array) -> Array:
+    """Return Log(Q_truth Q_mean') (N, 3) of quaternions (N, 4)."""
+    out = np.empty((len(mean), 3))
+    for i in range(len(mean)):
+        turn = log(multiply(truth[i], conjugate(mean[i])))
+        for j in range(3):
+            out[i, j] = turn[j]
+    return out
 
 
 def rotation_error(mean: Array, truth: Array) -> Array:
     """Return Log(Q_truth Q_mean') (..., 3), at most pi long, for unit quaternions (..., 4)."""
-    mean, truth = np.asarray(mean, dtype=np.float64), np.asarray(truth, dtype=np.float64)
-    v, w, v2, w2 = truth[..., :3], truth[..., 3:], -mean[..., :3], mean[..., 3:]
-    vector = w * v2 + w2 * v + np.cross(v, v2)
-    scalar = w * w2 - np.sum(v * v2, axis=-1, keepdims=True)
-    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, np.abs(scalar))
-    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
-    return np.where(scalar < 0.0, -scale, scale) * vector
+    return rotations_between(rows(mean), rows(truth)).reshape(*np.shape(mean)[:-1], 3)
+
+
+def rows(values: Any, shape: tuple[int, ...] | None = None) -> Array:
+    """Return values (..., n), broadcast to a shape if one is given, as contiguous rows (N, n)."""
+    values = np.asarray(values, dtype=np.float64)
+    values = values if shape is None else np.broadcast_to(values, shape)
+    return np.ascontiguousarray(values).reshape(-1, values.shape[-1])
 
 
 def point_error(mean: Array, truth: Array, dtheta: Any, coordinates: str) -> Array:
@@ -171,9 +193,8 @@ def point_error(mean: Array, truth: Array, dtheta: Any, coordinates: str) -> Arr
         return d
     if coordinates != "log":
         raise ValueError(f"coordinates is {coordinates!r}, expected 'world' or 'log'")
-    if d.shape[-1] == 3:
-        return turned_back(np.asarray(dtheta, dtype=np.float64), d)
-    return np.einsum("...ij,...j->...i", left_jacobian_inverse(dtheta), d)
+    turn = np.asarray(dtheta) if d.shape[-1] == 3 else np.asarray(dtheta)[..., None]
+    return all_in_log(rows(turn, (*d.shape[:-1], turn.shape[-1])), rows(d)).reshape(d.shape)
 
 
 def pose_error(mean: Array, truth: Array, coordinates: str = "world") -> Array:
@@ -191,23 +212,87 @@ def pose_error(mean: Array, truth: Array, coordinates: str = "world") -> Array:
     return np.concatenate([position, dtheta[..., None]], axis=-1)
 
 
+@compiled
+def factorize(S: Array, n: int) -> bool:
+    """Replace the first n columns of S (n + E, n + E) by those of its Cholesky factor; return whether it is regular."""
+    if n > FEW:
+        return kernels.cholesky(S)
+    for i in range(len(S)):
+        for j in range(min(i + 1, n)):
+            s = S[i, j]
+            for k in range(j):
+                s -= S[i, k] * S[j, k]
+            S[i, j] = math.sqrt(max(s, 0.0)) if i == j else s / S[j, j]
+    return True
+
+
+@compiled
+def write_nees(d: Array, P: Array, at: int, n: int, out: Array) -> None:
+    """Write the NEES (E,) of E errors d (E, .), of their n numbers from `at` on, whose covariance P has in these rows.
+
+    Of P the lower triangle is read.  NaN where P is singular.  By the Cholesky factor L of the correlation with the
+    scaled errors as more rows: there it has L^-1 d.
+    """
+    E = len(d)
+    S, sigma = np.zeros((n + E, n + E)), np.empty(n)
+    out.fill(np.nan)
+    for i in range(n):
+        variance = P[at + i, at + i]
+        if not 0.0 < variance < np.inf:
+            return
+        sigma[i] = math.sqrt(variance)
+        for j in range(i + 1):
+            S[i, j] = P[at + i, at + j] / (sigma[i] * sigma[j])
+        for c in range(E):
+            S[n + c, i], S[n + c, n + c] = d[c, at + i] / sigma[i], 1e300
+    if not factorize(S, n):
+        return
+    for c in range(E):
+        value = 0.0
+        for i in range(n):
+            value += S[n + c, i] ** 2 if S[i, i] ** 2 > SINGULAR else np.nan
+        out[c] = value
+
+
+@compiled
+def all_nees(d: Array, P: Array) -> Array:
+    """Return the NEES (N,) of errors d (N, 1, n) with covariances P (N, n, n)."""
+    out = np.empty((len(d), 1))
+    for k in range(len(d)):
+        write_nees(d[k], P[k], 0, P.shape[1], out[k])
+    return out[:, 0]
+
+
 def nees(d: Array, P: Array) -> Array:
     """Return d^T P^-1 d (...) for errors (..., n) and covariances (..., n, n); NaN where P is singular.
 
-    Singular: a variance that is not positive, or a correlation matrix with an eigenvalue below 1e-12.
+    Singular: a variance that is not positive, or a pivot of the correlation matrix below 1e-12.
     """
-    d, P = np.asarray(d, dtype=np.float64), np.asarray(P, dtype=np.float64)
-    variance = np.einsum("...ii->...i", P)
-    regular = (variance > 0.0).all(-1) & np.isfinite(P).all((-2, -1)) & np.isfinite(d).all(-1)
-    sigma = np.sqrt(np.where(regular[..., None], variance, 1.0))
-    correlation = np.where(
-        regular[..., None, None], P / (sigma[..., :, None] * sigma[..., None, :]), np.eye(d.shape[-1])
-    )
-    regular &= np.linalg.eigvalsh(correlation)[..., 0] > SINGULAR
-    correlation = np.where(regular[..., None, None], correlation, np.eye(d.shape[-1]))
-    scaled = np.where(regular[..., None], d / sigma, 0.0)
-    value = np.einsum("...i,...i->...", scaled, np.linalg.solve(correlation, scaled[..., None])[..., 0])
-    return np.where(regular, value, np.nan)
+    P = np.ascontiguousarray(P, dtype=np.float64)
+    return all_nees(rows(d, P.shape[:-1])[:, None], P.reshape(-1, *P.shape[-2:])).reshape(P.shape[:-2])
+
+
+@compiled
+def map_nees(d: Array, P: Array, first: Index, sizes: Index) -> Array:
+    """Return the NEES of a map (6,), as `MAP_NEES` names them, of errors d (2, n) in own and in world coordinates.
+
+    P (n or more, n or more) is the covariance of the joint state, in which landmarks have the rows from `first` (B,)
+    on, as many as `sizes` (B,) says.
+    """
+    out, value, n = np.full(6, np.nan), np.empty(2), d.shape[1]
+    sums, regular, dof = np.zeros(2), np.zeros(2), 0.0
+    for i in range(len(first)):
+        write_nees(d, P, first[i], sizes[i], value)
+        dof += sizes[i] if np.isfinite(value[0]) else 0.0
+        for c in range(2):
+            if np.isfinite(value[c]):
+                sums[c], regular[c] = sums[c] + value[c], regular[c] + 1.0
+    out[0], out[1], out[2] = sums[0] / regular[0], sums[1] / regular[1], dof / regular[0]  # NaN of none
+    write_nees(d, P, 0, n, value)
+    out[3], out[4] = value[0], value[1]
+    if np.isfinite(value[0]):
+        out[5] = n
+    return out
 
 
 def most_nees(d: Array, P: Array) -> float:
@@ -259,10 +344,8 @@ def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tu
     return float(quantile(tail, dof * runs)) / runs, float(quantile(1.0 - tail, dof * runs)) / runs
 
 
-def diverged(
-    d: Array, P: Array, error_m: Array, truth: Array, nees: Callable[[Array, Array], Array] = nees
-) -> bool:  # fmt: skip
-    """Tell whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
+def diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:
+    """Return whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
 
     `d` (N, 2 or 3) is the position error in the estimator's coordinates, `P` its covariance, `error_m` (N,) its
     length in metres, `truth` (N, 2 or 3) the true path.  Sigmas are counted as the Mahalanobis distance.
