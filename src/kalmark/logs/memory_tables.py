@@ -11,7 +11,7 @@ from kalmark.events import shown
 from kalmark.logs.formats import requested, robot_names, selected
 from kalmark.logs.log import Log
 from kalmark.logs.native import EVENTS, FILES, of_tables
-from kalmark.logs.table import CSV, Sheet
+from kalmark.logs.table import CSV, Content
 
 
 def log_from(
@@ -46,8 +46,8 @@ def log_from(
     return selected(log, request, from_s, to_s, ids)
 
 
-def sheet(name: str, table: Any) -> Sheet:
-    """Return a table in memory.  Raises LogError."""
+def sheet(name: str, table: Any) -> Content:
+    """Return the content of a table in memory.  Raises LogError."""
     table = table.to_pydict() if hasattr(table, "to_pydict") else table  # pyarrow
     names = list(table) if isinstance(table, Mapping) else list(getattr(table, "columns", ()))
     if not names or not all(isinstance(each, str) for each in names):
@@ -55,7 +55,13 @@ def sheet(name: str, table: Any) -> Sheet:
         raise LogError(f"{name}: got {told}, expected a frame or a mapping with named columns")
     columns = {each: values(table[each]) for each in names}
     many = max((len(column) for column in columns.values() if isinstance(column, list)), default=1)
-    return Sheet(name, {each: v if isinstance(v, list) else [v] * many for each, v in columns.items()})
+    filled = {each: v if isinstance(v, list) else [v] * many for each, v in columns.items()}
+    sizes = {each: len(v) for each, v in filled.items()}
+    for each, size in sizes.items():
+        if size != sizes[names[0]]:
+            wanted = f"{sizes[names[0]]} as {names[0]!r} has"
+            raise LogError(f"{name}: column {each!r} has {size} values, expected {wanted}")
+    return Content([*filled], name, enumerate(zip(*filled.values(), strict=True), start=1), " row ")
 
 
 def values(column: Any) -> list[Any] | str | float:

@@ -42,7 +42,7 @@ from kalmark.logs.geodesy import Globe, origin_of
 from kalmark.logs.images.image_files import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
-from kalmark.logs.table import PARQUET, Refused, Row, Sheet, read_table
+from kalmark.logs.table import PARQUET, Content, Refused, Row, read_table
 from kalmark.logs.table_columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
 
 RIG = "rig.yaml"
@@ -98,7 +98,7 @@ def tables(path: Path) -> dict[str, Path]:
 
 
 def of_tables(
-    there: Mapping[str, Path | Sheet], request: Request, called: str, path: Path | None, describes: dict[str, Any],
+    there: Mapping[str, Path | Content], request: Request, called: str, path: Path | None, describes: dict[str, Any],
     globe: Globe | None = None,
 ) -> Log:  # fmt: skip
     """Return the log of tables, by the names of their CSV files.  Raises LogError with file and line."""
@@ -162,7 +162,7 @@ class _Reader:
         self.truth: dict[str, Trajectory] = {}
         self.landmarks: dict[Id, Array] = {}
         self.gps: dict[str, PositionTrack] = {}
-        self.readers: tuple[Callable[[Path | Sheet], Iterator[Event] | None], ...] = (
+        self.readers: tuple[Callable[[Path | Content], Iterator[Event] | None], ...] = (
             self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps,
             self.measurements, self.frames,
         )  # fmt: skip
@@ -171,7 +171,7 @@ class _Reader:
         """Note where the controls, fixes or scans of a row begin."""
         self.places.setdefault((row.table.path, *row.key), row.line)
 
-    def controls(self, path: Path | Sheet) -> Iterator[Event]:
+    def controls(self, path: Path | Content) -> Iterator[Event]:
         """Yield the controls of `controls.csv`."""
 
         def make(row: Row) -> Event:
@@ -182,7 +182,7 @@ class _Reader:
 
         return read_table(path, ("t_s", "robot"), known=known_columns(CONTROL)).made(self.request, make)
 
-    def scans(self, path: Path | Sheet) -> Iterator[Event]:
+    def scans(self, path: Path | Content) -> Iterator[Event]:
         """Yield the scans of `scans.csv`: one a robot, sensor and time."""
         scans: dict[tuple[str, str], _Rows] = {}  # those that may still get rows: of each sensor the last
 
@@ -205,7 +205,7 @@ class _Reader:
         for key, rows in scans.items():
             yield from self.closed(path, key, rows)
 
-    def closed(self, path: Path | Sheet, key: tuple[str, str], rows: _Rows) -> Iterator[Event]:
+    def closed(self, path: Path | Content, key: tuple[str, str], rows: _Rows) -> Iterator[Event]:
         """Yield the event of the rows of a scan, which has no more; none if all of them are bad."""
         if not rows.y and not rows.empty:
             return
@@ -234,7 +234,7 @@ class _Reader:
         rows.covs.append(cov)
         rows.lines.append(row.line)
 
-    def measurements(self, path: Path | Sheet) -> Iterator[Event]:
+    def measurements(self, path: Path | Content) -> Iterator[Event]:
         """Yield the readings of `measurements.csv`, one a row."""
 
         def make(row: Row) -> Event:
@@ -246,7 +246,7 @@ class _Reader:
         table = read_table(path, ("t_s", "robot", "sensor"), known=known_columns(), globe=self.globe)
         return table.made(self.request, make, by_sensor=True)
 
-    def frames(self, path: Path | Sheet) -> Iterator[Event]:
+    def frames(self, path: Path | Content) -> Iterator[Event]:
         """Yield the frames of `frames.csv`, without those whose images cannot be used."""
         folder, album = Path(str(path)).parent, Album()
 
@@ -262,7 +262,7 @@ class _Reader:
         yield from table.made(self.request, make, by_sensor=True)
         album.report(self.request)
 
-    def fixes(self, path: Path | Sheet) -> Iterator[Event]:
+    def fixes(self, path: Path | Content) -> Iterator[Event]:
         """Yield the absolute positions of `fixes.csv`."""
         table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",), globe=self.globe)
         if not table.noise_columns:
@@ -279,7 +279,7 @@ class _Reader:
 
         return table.made(self.request, make)
 
-    def read_truth(self, path: Path | Sheet) -> None:
+    def read_truth(self, path: Path | Content) -> None:
         """Read `truth.csv`: the true trajectory of each robot."""
         table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3), globe=self.globe)
         if set(table.value_columns) not in (set(POSE2), set(POSE3)):
@@ -298,7 +298,7 @@ class _Reader:
         table.each(self.request, take, strictly=True)
         self.truth = {robot: Trajectory.of(p) for robot, p in paths.items()}
 
-    def read_landmarks(self, path: Path | Sheet) -> None:
+    def read_landmarks(self, path: Path | Content) -> None:
         """Read `landmarks.csv`: true positions, both ends of lines (6,), poses of tags (7,)."""
 
         def take(row: Row) -> None:
@@ -315,7 +315,7 @@ class _Reader:
         table = read_table(path, ("id", "x_m", "y_m"), allowed=LANDMARK3[2:], globe=self.globe)
         table.each(self.request, take, timed=False)
 
-    def read_gps(self, path: Path | Sheet) -> None:
+    def read_gps(self, path: Path | Content) -> None:
         """Read `gps.csv`: position fixes that only score a run."""
         tracks: dict[str, tuple[list[int], list[list[float]]]] = {}
 

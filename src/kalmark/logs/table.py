@@ -54,17 +54,6 @@ _RANK = {name: rank for rank, name in enumerate(CANONICAL)}
 _COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """A table in memory: values by column, None for an empty cell."""
-
-    name: str
-    columns: dict[str, list[Any]]
-
-    def __str__(self) -> str:
-        return self.name
-
-
 class Content(NamedTuple):
     """What a source has: its header with the place of it, rows with their numbers, and how much of it has been read.
 
@@ -78,6 +67,9 @@ class Content(NamedTuple):
     comma: bool = False
     size: int = 0
     at: Callable[[], int] = lambda: 0
+
+    def __str__(self) -> str:
+        return self.where
 
 
 @dataclass(frozen=True)
@@ -157,55 +149,40 @@ class Table:
                 raise LogError(f"{told}all {len(size)} numbers are within pi and reach it, expected {wanted}")
 
 
-def opened(source: Path | Sheet) -> Content:
+def opened(source: Path | Content) -> Content:
     """Return what a source has.  Raises LogError if it is missing, empty or none of its kind."""
-    if isinstance(source, Sheet):
-        return _of_sheet(source)
+    if isinstance(source, Content):
+        return source
     return _of_parquet(source) if source.suffix == PARQUET else _of_csv(source)
 
 
-def _of_sheet(sheet: Sheet) -> Content:
-    if not sheet.columns:
-        raise LogError(f"{sheet}: no columns, expected some with names")
-    first, many = next((name, len(values)) for name, values in sheet.columns.items())
-    for name, values in sheet.columns.items():
-        if len(values) != many:
-            raise LogError(f"{sheet}: column {name!r} has {len(values)} values, expected {many} as {first!r} has")
-    rows = enumerate(zip(*sheet.columns.values(), strict=True), start=1)
-    return Content([*sheet.columns], str(sheet), rows, " row ")
-
-
 def _of_parquet(path: Path) -> Content:
-    import pyarrow
-    import pyarrow.parquet
+    def parts() -> Iterator[Any]:
+        """Yield the names of the columns and the number of rows, then columns of some rows at a time."""
+        import pyarrow
+        import pyarrow.parquet
 
-    def odd(error: Exception) -> LogError:
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        return LogError(f"{path}: not a file of Parquet that can be read ({reason}), expected a whole one")
+        try:
+            file = pyarrow.parquet.ParquetFile(path)
+            yield [str(name) for name in file.schema_arrow.names], file.metadata.num_rows
+            for batch in file.iter_batches(BATCH):
+                yield [column.to_pylist() for column in batch.columns]
+        except (pyarrow.ArrowException, OSError, ValueError, UnicodeError) as error:
+            reason = " ".join(str(error).split())[:160] or type(error).__name__
+            told = f"{path}: not a file of Parquet that can be read ({reason})"
+            raise LogError(f"{told}, expected a whole one") from None
 
-    try:
-        file = pyarrow.parquet.ParquetFile(path)
-        names = [str(name) for name in file.schema_arrow.names]
-    except (pyarrow.ArrowException, OSError, ValueError, UnicodeError) as error:
-        raise odd(error) from None
-    done = 0
+    found, done = parts(), 0
+    names, size = next(found)
 
     def rows() -> Iterator[tuple[int, Sequence[Any]]]:
         nonlocal done
-        batches = file.iter_batches(BATCH)
-        while True:
-            try:
-                batch = next(batches, None)
-                if batch is None:
-                    return
-                columns = [column.to_pylist() for column in batch.columns]
-            except (pyarrow.ArrowException, OSError, ValueError, UnicodeError) as error:
-                raise odd(error) from None
+        for columns in found:
             for cells in zip(*columns, strict=True):
                 done += 1
                 yield done, cells
 
-    return Content(names, str(path), rows(), " row ", size=file.metadata.num_rows, at=lambda: done)
+    return Content(names, str(path), rows(), " row ", size=size, at=lambda: done)
 
 
 def _of_csv(path: Path, separator: str = ",") -> Content:
@@ -251,7 +228,7 @@ def _of_csv(path: Path, separator: str = ",") -> Content:
 
 
 def read_table(
-    source: Path | Sheet, required: tuple[str, ...], allowed: tuple[str, ...] | None = None,
+    source: Path | Content, required: tuple[str, ...], allowed: tuple[str, ...] | None = None,
     known: tuple[str, ...] = (), globe: Globe | None = None,
 ) -> Table:  # fmt: skip
     """Return the table of a source, which must have the columns `required`.
