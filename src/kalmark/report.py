@@ -61,7 +61,7 @@ class Compared(NamedTuple):
     places: Array
 
 
-class Judged(NamedTuple):
+class JudgedScan(NamedTuple):
     """The observations `rows` of a scan that were compared with landmarks, and what came of it; `ids` of all the scan.
 
     d2 is NaN where the covariance of the innovation is not positive definite, infinite where nothing can be expected.
@@ -74,7 +74,7 @@ class Judged(NamedTuple):
     gate: float
 
 
-def outcomes_of(judged: Judged) -> list[Observation]:
+def outcomes_of(judged: JudgedScan) -> list[Observation]:
     """Return what became of each observation."""
     rows, ids, names, done, gate = judged
     d2, fused = done.d2.tolist(), done.fused.tolist()
@@ -215,7 +215,7 @@ class Report:
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
-        self.judged: tuple[Judged, ...] = ()  # of which `observations` are made when they are asked for
+        self.judged: tuple[JudgedScan, ...] = ()  # of which `observations` are made when they are asked for
         self._made: tuple[Observation, ...] = ()
         self.removed: tuple[tuple[Id, str], ...] = ()
         self.merged: tuple[tuple[Id, Id, str], ...] = ()

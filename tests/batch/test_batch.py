@@ -12,7 +12,7 @@ import pytest
 
 import kalmark as km
 from batch_dense import Link, Sight, link, optimum
-from kalmark.batch.batch_state import POSES, State, plus
+from kalmark.batch.batch_state import POSES, BatchState, plus
 from kalmark.batch.data import replayed
 from kalmark.batch.problem import Rows
 from kalmark.batch.solver import Batch
@@ -190,7 +190,7 @@ def test_the_hessian_is_the_derivative_of_the_gradient() -> None:
     m = 50 * np.random.default_rng(0).normal(size=3 * n)
 
     def gradient(x: Array) -> Array:
-        at = problem.at(State(start.spaces, (x[: 3 * n].reshape(n, 3), x[3 * n :].reshape(-1, 2))))
+        at = problem.at(BatchState(start.spaces, (x[: 3 * n].reshape(n, 3), x[3 * n :].reshape(-1, 2))))
         return at.J.T @ m - at.H.T @ at.z
 
     x = np.concatenate([start.groups[POSES].ravel(), start.groups[1].ravel()])
@@ -207,7 +207,7 @@ def test_the_gradient_of_a_robust_factor_is_the_derivative_of_its_sum() -> None:
     n, x = 3 * len(start.groups[POSES]), x + 0.1 * rng.normal(size=len(x))
 
     def rows(x: Array) -> Rows:
-        return factor.rows(State(start.spaces, (x[:n].reshape(-1, 3), x[n:].reshape(-1, 2))))
+        return factor.rows(BatchState(start.spaces, (x[:n].reshape(-1, 3), x[n:].reshape(-1, 2))))
 
     lengths = np.linalg.norm(rows(x).z.reshape(len(factor.y), -1), axis=1)
     assert (lengths < 3.0).sum() > 3 < (lengths > 3.0).sum()
@@ -222,7 +222,7 @@ def test_the_start_of_the_search_does_not_matter_even_turned_by_half_a_radian() 
     turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
     poses = batch.state.groups[POSES]
     poses = np.column_stack([poses[:, :2] @ turn.T, poses[:, 2] + 0.5 * np.linspace(0, 2, len(poses))])
-    again = solve_batch(run, log, initial=State(batch.state.spaces, (poses, batch.means @ turn.T)))
+    again = solve_batch(run, log, initial=BatchState(batch.state.spaces, (poses, batch.means @ turn.T)))
     assert np.allclose(again.means, batch.means, atol=1e-8)
     assert again.chi2 == pytest.approx(batch.chi2, abs=1e-6)
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import kalmark as km
-from kalmark.batch.batch_state import LANDMARKS, POSES, State
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
 from kalmark.batch.data import replayed
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
@@ -139,7 +139,7 @@ def test_the_hessian_in_space_is_the_derivative_of_the_gradient() -> None:
     def gradient(d: Array) -> Array:
         poses = np.array([SE3.plus(*row) for row in zip(start.groups[POSES], d[: 6 * n].reshape(n, 6), strict=True)])
         points = start.groups[LANDMARKS] + d[6 * n :].reshape(-1, 3)
-        at = problem.at(State(start.spaces, (poses, points)))
+        at = problem.at(BatchState(start.spaces, (poses, points)))
         return at.J.T @ m - at.H.T @ at.z
 
     numerical = np.array([(gradient(d) - gradient(-d)) / 2e-5 for d in 1e-5 * np.eye(start.ends[-1])])

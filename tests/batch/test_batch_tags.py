@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 import kalmark as km
 from kalmark.batch.batch_state import FIRST_MOUNT
-from kalmark.batch.data import Associations, Given, replayed
+from kalmark.batch.data import Associations, BatchInput, replayed
 from kalmark.batch.solver import optimum
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames3d, rotations
@@ -115,7 +115,7 @@ def adjust(
     names = np.array([f"camera {j}" for j in seen.camera])
     ids = seen.tag.tolist()
     index = np.arange(len(ids)) - first[scan]
-    given = Given(
+    given = BatchInput(
         robots={"rig": km.Robot("rig", MOTION, sensors=sensors)},
         landmark=km.landmarks.Tag(),
         t_ns=scans // 2,

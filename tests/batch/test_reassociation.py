@@ -11,7 +11,7 @@ import pytest
 from hall import hall, mapped
 
 import kalmark as km
-from kalmark.batch.data import Replay, replayed
+from kalmark.batch.data import BatchReplay, replayed
 from kalmark.batch.reassociation import Reassociated, reassociated
 from kalmark.batch.solver import optimum
 from kalmark.config import build_slam
@@ -34,7 +34,7 @@ def known() -> tuple[Run, Log]:
 def decided_again(run: Run, log: Log, names: Sequence[Any], free: bool = True) -> Reassociated:
     given = given_by(run)
     given = replace(given, associations=replace(given.associations, landmark=names))
-    return reassociated(Replay.of(given, log), np.full(len(names), free))
+    return reassociated(BatchReplay.of(given, log), np.full(len(names), free))
 
 
 def parts(names: Sequence[Any]) -> set[frozenset[int]]:

@@ -12,14 +12,14 @@ import kalmark as km
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
 from kalmark.models.landmarks import Point2D
-from kalmark.models.model_check import Finding, check_model
+from kalmark.models.model_check import CheckResult, check_model
 from kalmark.models.motion import Unicycle
 from kalmark.simulate.robots import diffused
 
 Array = npt.NDArray[np.float64]
 
 
-def check(model: Any) -> dict[str, Finding]:
+def check(model: Any) -> dict[str, CheckResult]:
     return {finding.what: finding for finding in check_model(model, np.random.default_rng(0))}
 
 

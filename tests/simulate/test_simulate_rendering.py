@@ -18,7 +18,7 @@ from kalmark.logs import write_native
 from kalmark.models import cameras
 from kalmark.simulate import load_world, simulate
 from kalmark.simulate.layouts import TexturedPlanes, TexturedRoom
-from kalmark.simulate.rendering import SKY, Plane, Renderer, texture
+from kalmark.simulate.rendering import SKY, Rectangle, Renderer, texture
 
 SIZE = {"width_px": 320, "height_px": 240}
 K = {"fx_px": 250.0, "fy_px": 255.0, "cx_px": 158.0, "cy_px": 121.0}
@@ -46,7 +46,7 @@ def test_a_corner_on_a_plane_lies_where_the_camera_model_has_it(name: str) -> No
 
     camera, checks = CAMERAS[name], 12
     board = np.kron(np.indices((checks, checks)).sum(axis=0) % 2, np.ones((40, 40))).astype(np.uint8)
-    plane = Plane(pose(0.0, 0.0, 0.0, 0, 0, 0), 40 + 160 * board, 0.0025)  # 1.2 m wide
+    plane = Rectangle(pose(0.0, 0.0, 0.0, 0, 0, 0), 40 + 160 * board, 0.0025)  # 1.2 m wide
     inner = 0.1 * np.indices((checks + 1, checks + 1))[::-1, 1:-1, 1:-1].reshape(2, -1).T
     points = from_frame_many(plane.pose, np.column_stack([inner, np.zeros(len(inner))]))[0]
     T = pose(0.55, 0.7, -0.6, 14, -11, 25)
@@ -95,7 +95,7 @@ def test_textures_and_noise_are_those_of_the_seed_and_noise_has_its_sigma() -> N
     drawn = [texture(1.0, 0.5, 0.005, np.random.default_rng(seed), 60.0) for seed in (1, 1, 2)]
     assert (drawn[0] == drawn[1]).all()
     assert (drawn[0] != drawn[2]).any()
-    plane = Plane(pose(-5, -5, 2, 0, 0, 0), np.full((100, 100), 100, np.uint8), 0.1)
+    plane = Rectangle(pose(-5, -5, 2, 0, 0, 0), np.full((100, 100), 100, np.uint8), 0.1)
     image, depth = Renderer([plane], CAMERAS["ideal"]).taken(pose(0, 0, 0, 0, 0, 0), np.random.default_rng(0), noise=3)
     assert (depth == 2).all()
     assert image.std() == pytest.approx(3, rel=0.03)

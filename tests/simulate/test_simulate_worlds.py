@@ -29,7 +29,7 @@ from kalmark.simulate.layouts import (
     ThickCloister,
 )
 from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control
-from kalmark.simulate.sights import Sensing
+from kalmark.simulate.sights import SimulatedSensing
 from kalmark.simulate.worlds import SimulatedRobot
 
 SMALL = ["steps=20"]
@@ -214,7 +214,7 @@ def test_the_page_about_worlds_names_every_world_key_and_figure() -> None:
     from kalmark.campaign import run_campaign
 
     page = PAGE.read_text(encoding="utf-8")
-    sections = (World, Cloister, Loop, RandomField, Listed, Constant, Waypoints, Wander, Lanes, Sensing)
+    sections = (World, Cloister, Loop, RandomField, Listed, Constant, Waypoints, Wander, Lanes, SimulatedSensing)
     sections += (
         ThickCloister,
         House,

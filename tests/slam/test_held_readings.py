@@ -11,7 +11,7 @@ import pytest
 import kalmark as km
 from kalmark.arrays import Array
 from kalmark.logs.log import Log
-from kalmark.slam.held_readings import AGAIN, CHANCE, Given
+from kalmark.slam.held_readings import AGAIN, CHANCE, LastMeasurement
 
 MOTION = km.motion.Odometry2D(0.002, 0.002, 0.001)
 GPS = km.sensors.Gps2D(0.5)
@@ -97,7 +97,7 @@ def test_a_coarse_compass_repeats_its_numbers_by_chance_and_a_fine_one_does_not(
 def test_the_chance_of_equal_numbers_is_that_of_gaussian_noise() -> None:
     rng, q, sigma = np.random.default_rng(3), 0.2, 1.0
     y: Array = np.round(sigma * rng.normal(size=(20000, 1)) / q) * q
-    given = Given.of(y[:1], None)
+    given = LastMeasurement.of(y[:1], None)
     equal = np.mean([given.take(one[None], None) for one in y[1:]])
     assert given.chance == pytest.approx(q / (2.0 * sigma * np.sqrt(np.pi)), rel=0.2)
     assert given.chance == pytest.approx(equal, rel=0.2)

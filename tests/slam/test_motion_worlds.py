@@ -18,7 +18,7 @@ from kalmark.logs import open_log, write_native
 from kalmark.simulate import load_world, simulate
 from kalmark.simulate.robots import simulation
 from kalmark.slam.description import describe
-from kalmark.slam.held_control import Mean
+from kalmark.slam.held_control import RateMean
 
 CALIBRATED = ("differential_drive", "tricycle", "omnidirectional", "mecanum")
 STATES = ("slipping_unicycle", "constant_velocity", "constant_turn_rate")
@@ -99,7 +99,7 @@ def test_constants_are_found_beside_a_gyroscope_that_shows_the_noise_of_the_whee
 
 def test_the_mean_of_controls_follows_a_change_at_once_and_noise_slowly() -> None:
     rng, sigma = np.random.default_rng(0), np.array([0.1, 0.02])
-    mean = Mean(np.zeros(2), 1)
+    mean = RateMean(np.zeros(2), 1)
     for k in range(1, 200):
         mean = mean.after(sigma * rng.uniform(-1, 1, 2), sigma)
         assert mean.number == min(k + 1, 30)

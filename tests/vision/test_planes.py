@@ -7,7 +7,7 @@ import pytest
 
 import kalmark as km
 from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, to_frame_many
-from kalmark.simulate.rendering import Plane as Wall
+from kalmark.simulate.rendering import Rectangle as Wall
 from kalmark.simulate.rendering import Renderer, texture
 from kalmark.vision.appearance import View, predicted, taken
 from kalmark.vision.features import Cells

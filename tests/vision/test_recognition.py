@@ -13,7 +13,7 @@ import kalmark as km
 from kalmark.config import build_slam
 from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, minus
 from kalmark.simulate import load_world, simulate
-from kalmark.simulate.rendering import Plane, Renderer, texture
+from kalmark.simulate.rendering import Rectangle, Renderer, texture
 from kalmark.vision.appearance import View, taken
 from kalmark.vision.recognition import LEAST, REACH, of_corners, of_patches, pairs, recognised
 
@@ -33,8 +33,8 @@ def pose(*numbers: float) -> np.ndarray:
 def scene() -> Renderer:
     """Return a wall 2 m before a camera at the origin that looks along z, and a board before it."""
     rng = np.random.default_rng(3)
-    wall = Plane(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, 0.004, rng, 60.0), 0.004)
-    board = Plane(pose(-0.6, -0.4, 1.5, 5, 0, 0), texture(0.7, 0.7, 0.004, rng, 200.0), 0.004)
+    wall = Rectangle(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, 0.004, rng, 60.0), 0.004)
+    board = Rectangle(pose(-0.6, -0.4, 1.5, 5, 0, 0), texture(0.7, 0.7, 0.004, rng, 200.0), 0.004)
     return Renderer([wall, board], CAMERA)
 
 
@@ -67,7 +67,7 @@ def test_a_sensor_recognises_where_it_is_from_elsewhere(then: tuple[float, ...])
 def test_a_camera_with_a_wide_view_recognises_where_it_is_too() -> None:
     camera, first = km.sensors.Omnidirectional(), pose(0, 0, 1.0, 0, 0, 0)
     rng = np.random.default_rng(3)
-    wall = Plane(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, 0.004, rng, 60.0), 0.004)
+    wall = Rectangle(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, 0.004, rng, 60.0), 0.004)
     renderer = Renderer([wall], camera)
     views, places = known(renderer, first, 60, camera)
     now = pose(0.05, -0.05, 1.0, 0, 2, 10)
@@ -78,7 +78,7 @@ def test_a_camera_with_a_wide_view_recognises_where_it_is_too() -> None:
 
 def test_another_place_is_not_recognised() -> None:
     views, places = known(scene(), pose(0, 0, 0, 0, 0, 0), 60)
-    other = Plane(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, 0.004, np.random.default_rng(8), 60.0), 0.004)
+    other = Rectangle(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, 0.004, np.random.default_rng(8), 60.0), 0.004)
     image = Renderer([other], CAMERA).taken(pose(0, 0, 0, 0, 0, 0), np.random.default_rng(1))[0]
     assert recognised(cv2, image, views, places, CAMERA) is None
     assert recognised(cv2, np.zeros_like(image), views, places, CAMERA) is None

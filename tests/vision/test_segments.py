@@ -13,7 +13,7 @@ import kalmark as km
 from kalmark.config import open_run
 from kalmark.errors import ConfigError
 from kalmark.geometry.frames3d import from_euler_pose
-from kalmark.simulate.rendering import Plane, Renderer
+from kalmark.simulate.rendering import Rectangle, Renderer
 from kalmark.vision.overlay import MATCH
 from kalmark.vision.segments import REACH_PX, LineFrontEnd, compatible, paired, profiles
 from kalmark.vision.straight import Straightened
@@ -29,7 +29,7 @@ BOXES = {2.0: [(-1.2, -0.8, -0.4, 0.1), (0.3, -0.5, 1.3, 0.5)], 3.0: [(-0.5, 0.3
 """Dark rectangles (x from, y from, x to, y to) in m, on two planes before the camera by their depth, m."""
 
 
-def boxes() -> list[Plane]:
+def boxes() -> list[Rectangle]:
     """Return the planes: only the rectangles of the near one are there, all of the far one."""
     planes = []
     for depth, some in BOXES.items():
@@ -39,11 +39,11 @@ def boxes() -> list[Plane]:
                 rows, columns = (slice(round((a + o) / PIXEL_M), round((b + o) / PIXEL_M))
                                  for a, b, o in ((y0, y1, 3.0), (x0, x1, 4.0)))  # fmt: skip
                 far[rows, columns] = 90
-            planes.append(Plane(np.array([-4.0, -3.0, depth, 0, 0, 0, 1.0]), far, PIXEL_M))
+            planes.append(Rectangle(np.array([-4.0, -3.0, depth, 0, 0, 0, 1.0]), far, PIXEL_M))
             continue
         for x0, y0, x1, y1 in some:
             near = np.full((round((y1 - y0) / PIXEL_M), round((x1 - x0) / PIXEL_M)), 60, np.uint8)
-            planes.append(Plane(np.array([x0, y0, depth, 0, 0, 0, 1.0]), near, PIXEL_M))
+            planes.append(Rectangle(np.array([x0, y0, depth, 0, 0, 0, 1.0]), near, PIXEL_M))
     return planes
 
 

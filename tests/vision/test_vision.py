@@ -11,12 +11,12 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, open_run
 from kalmark.geometry.frames3d import compose, from_euler_pose, from_frame_many, minus, to_frame_many
-from kalmark.simulate.rendering import Plane, Renderer, texture
+from kalmark.simulate.rendering import Rectangle, Renderer, texture
 from kalmark.tracks.joint_expectation import Prospect
 from kalmark.vision.appearance import predicted, taken
 from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.pairs import with_pairs
-from kalmark.vision.planes import Plane as Surroundings
+from kalmark.vision.planes import Rectangle as Surroundings
 from kalmark.vision.selection import Search
 from kalmark.vision.template_matching import Searcher, correlation
 
@@ -35,9 +35,11 @@ def pose(*numbers: float) -> np.ndarray:
     return from_euler_pose(np.array([*numbers[:3], *np.radians(numbers[3:])]))[0]
 
 
-def wall(pixel_m: float = 0.004) -> Plane:
+def wall(pixel_m: float = 0.004) -> Rectangle:
     """Return a wall of 4 m by 3 m, 2 m before a camera at the origin, which looks along z."""
-    return Plane(pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, pixel_m, np.random.default_rng(3), 60.0), pixel_m)
+    return Rectangle(
+        pose(-2.0, -1.5, 2.0, 0, 0, 0), texture(4.0, 3.0, pixel_m, np.random.default_rng(3), 60.0), pixel_m
+    )
 
 
 def pixels(camera: Any, T: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -149,11 +151,12 @@ def test_one_point_ransac_rejects_planted_outliers_and_keeps_the_rest(seed: int)
     assert sorted(np.flatnonzero(~found.matched).tolist()) == sorted(out)
 
 
-def sides() -> list[Plane]:
+def sides() -> list[Rectangle]:
     """Return the walls of a corner of a room."""
     return [
-        wall(), Plane(pose(-2.0, -1.5, 2.0, 0, 90, 0), texture(3.0, 3.0, 0.004, np.random.default_rng(4), 60.0), 0.004),
-        Plane(pose(-2.0, 0.9, 2.0, -90, 0, 0), texture(4.0, 3.0, 0.004, np.random.default_rng(6), 60.0), 0.004),
+        wall(),
+        Rectangle(pose(-2.0, -1.5, 2.0, 0, 90, 0), texture(3.0, 3.0, 0.004, np.random.default_rng(4), 60.0), 0.004),
+        Rectangle(pose(-2.0, 0.9, 2.0, -90, 0, 0), texture(4.0, 3.0, 0.004, np.random.default_rng(6), 60.0), 0.004),
     ]  # fmt: skip
 
 

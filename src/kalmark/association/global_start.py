@@ -45,7 +45,7 @@ class Located(NamedTuple):
     fates: Sequence[Observation] = ()
 
 
-class Pose(NamedTuple):
+class GlobalPose(NamedTuple):
     """A pose T (3,) and the landmark of each observation (K,), -1 for none."""
 
     T: Array
@@ -81,11 +81,11 @@ def located(query: Query) -> Located:
     return Located(found.T, decisions, why)
 
 
-def search(of: Known, v: Array, sigma: Array) -> Pose | str:
+def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:
     """Return the pose that places v (K, 2) with these sigmas (K,) determine, or why they do not."""
     if len(v) < FEWEST:
         return f"its scan has {len(v)} observations, a start needs {FEWEST}"
-    poses: list[Pose] = []
+    poses: list[GlobalPose] = []
     tried = 0
     for i, j in bases(v, sigma):
         T = hypotheses(of, v, sigma, i, j)
@@ -132,20 +132,20 @@ def hypotheses(of: Known, v: Array, sigma: Array, i: int, j: int) -> Array:
     return np.column_stack([(p[one] + p[other]) / 2 - turned, theta])
 
 
-def tested(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -> list[Pose]:
+def tested(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -> list[GlobalPose]:
     """Return of poses (H, 3) from a base those that most of the scan agrees with."""
     i, j = base
     turn = np.hypot(sigma[i], sigma[j]) / np.linalg.norm(v[j] - v[i])
     lever = np.linalg.norm(v - (v[i] + v[j]) / 2, axis=1)
     spread = np.sqrt(sigma**2 + (sigma[i] ** 2 + sigma[j] ** 2) / 4 + (turn * lever) ** 2)
-    found: list[Pose] = []
+    found: list[GlobalPose] = []
     for at in range(0, len(T), AT_ONCE):
         some = T[at : at + AT_ONCE]
         gaps, rows = of.tree().query(placed(some, v))
         near: Flags = gaps**2 <= chi2_gate(REACH, 2) * spread**2
         counts = near.sum(axis=1)
         for h in np.flatnonzero((counts >= FEWEST) & (counts >= counts.max() - AS_GOOD)).tolist():
-            found.append(Pose(some[h], np.where(near[h], rows[h], -1)))
+            found.append(GlobalPose(some[h], np.where(near[h], rows[h], -1)))
     most = max((pose.pairs for pose in found), default=0)
     return [pose for pose in found if pose.pairs > most - AS_GOOD]
 
@@ -156,7 +156,7 @@ def placed(T: Array, v: Array) -> Array:
     return np.stack([c * v[:, 0] - s * v[:, 1] + T[:, :1], s * v[:, 0] + c * v[:, 1] + T[:, 1:2]], axis=2)
 
 
-def refined(of: Known, v: Array, sigma: Array, pose: Pose) -> Pose:
+def refined(of: Known, v: Array, sigma: Array, pose: GlobalPose) -> GlobalPose:
     """Return a pose by least squares of all its pairs, and the pairs from there, of each landmark one."""
     T, matched = pose
     for _ in range(2):
@@ -172,12 +172,12 @@ def refined(of: Known, v: Array, sigma: Array, pose: Pose) -> Pose:
         for landmark in set(matched[near].tolist()):
             mine = np.flatnonzero(matched == landmark)
             matched[np.delete(mine, np.argmin(misfit[mine]))] = -1
-    return Pose(T, matched)
+    return GlobalPose(T, matched)
 
 
-def distinct(poses: list[Pose]) -> list[Pose]:
+def distinct(poses: list[GlobalPose]) -> list[GlobalPose]:
     """Return poses that are different ones, those with most pairs first."""
-    out: list[Pose] = []
+    out: list[GlobalPose] = []
     for pose in sorted(poses, key=lambda pose: -pose.pairs):
         if not any(same(pose.T, other.T) for other in out):
             out.append(pose)

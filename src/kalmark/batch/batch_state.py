@@ -31,7 +31,7 @@ def unsolved(what: str) -> KalmarkError:
     return KalmarkError(f"batch solution: {what}")
 
 
-class State(NamedTuple):
+class BatchState(NamedTuple):
     """The values of all blocks: rows (k, size) of a space for each group; the first are poses, the second landmarks.
 
     A step of the whole state is one error for each row of each group, in this order.
@@ -60,7 +60,7 @@ class State(NamedTuple):
         split = np.split(step, self.ends[:-1])
         return [part.reshape(-1, space.dof) for space, part in zip(self.spaces, split, strict=True)]
 
-    def moved(self, step: Array, followers: sp.csr_array) -> State:
+    def moved(self, step: Array, followers: sp.csr_array) -> BatchState:
         """Return the state after a step along the exponential, x + V(dtheta) dx.
 
         A pose turns by its own dtheta, a landmark with the poses that see it, by the weights `followers` (m, n).
@@ -68,7 +68,7 @@ class State(NamedTuple):
         parts = self.parts(step)
         turns = [parts[POSES][:, self.d :], followers @ parts[POSES][:, self.d :]]
         turns += [np.zeros((1, 0))] * len(parts[FIRST_MOUNT:])
-        return State(self.spaces, tuple(map(plus, self.spaces, self.groups, parts, turns)))
+        return BatchState(self.spaces, tuple(map(plus, self.spaces, self.groups, parts, turns)))
 
     def relative(self, step: Array) -> float:
         """Return the largest rotation in a step (n,) (rad), or translation over half the map extent (at least 1 m)."""

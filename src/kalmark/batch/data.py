@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, Ints, State, unsolved
+from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, BatchState, Ints, unsolved
 from kalmark.batch.motion_chain import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
 from kalmark.batch.wall_anchors import anchors
@@ -41,7 +41,7 @@ NONE = np.zeros(0, dtype=np.int64)
 FIRMLY = 0.1  # of the noise of its distance is the sigma of where a wall is anchored
 
 
-class Seen(NamedTuple):
+class BatchObservation(NamedTuple):
     """An observation: its node, what it is of (a landmark, None, or the node of a robot), y, R, and its number."""
 
     node: int
@@ -66,7 +66,7 @@ class Associations:
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
+class BatchInput:
     """What a batch solution needs beside the events: robots and their starts, associations, initial values.
 
     The S scans have the times `t_ns` (S,) and are of the `robot` (S,), `poses` (S, 3) or (S, 7) are the initial poses
@@ -108,22 +108,22 @@ class Given:
         return Point2D() if beside else self.landmark
 
 
-def replayed(given: Given, events: Iterable[Event]) -> Problem:
+def replayed(given: BatchInput, events: Iterable[Event]) -> Problem:
     """Return the problem of the motion and fixes of `events` and the observations that are associated.
 
     Raises KalmarkError for what cannot be solved for, or if the events are not those of the associations.
     """
-    return Replay.of(given, events).problem()
+    return BatchReplay.of(given, events).problem()
 
 
-class Replay:
+class BatchReplay:
     """Replays the events and gathers nodes, motions and sightings."""
 
-    def __init__(self, given: Given) -> None:
+    def __init__(self, given: BatchInput) -> None:
         self.given, self.known = given, given.known
         self.chain = Chain(given.robots if given.motion else {}, given.starts, given.biases)
         self.apart: dict[tuple[str, int], int] = {}  # nodes without motion, by robot and time
-        self.sighted: dict[tuple[str, str, int], list[Seen]] = {}  # by robot, sensor and group
+        self.sighted: dict[tuple[str, str, int], list[BatchObservation]] = {}  # by robot, sensor and group
         self.fixes: list[tuple[int, Array, Array]] = []
         self.fixed = 0  # fixes so far, with those that do not count
         self.nodes: list[int] = []
@@ -134,7 +134,7 @@ class Replay:
             self.rows.setdefault(scan, []).append(row)
 
     @classmethod
-    def of(cls, given: Given, events: Iterable[Event]) -> Replay:
+    def of(cls, given: BatchInput, events: Iterable[Event]) -> BatchReplay:
         """Return the events replayed.  Raises KalmarkError if they are not those of the associations."""
         replay = cls(given)
         for event in events:
@@ -146,7 +146,7 @@ class Replay:
 
     def reassociated(
         self, landmark: Sequence[Id | None], poses: Array, landmarks: Mapping[Id, tuple[Array, Array]]
-    ) -> Replay:
+    ) -> BatchReplay:
         """Return it with other landmarks of the observations, and other initial poses (S, .) and landmarks."""
         other = copy(self)
         associations = replace(self.given.associations, landmark=landmark)
@@ -211,7 +211,9 @@ class Replay:
             target, group = used.landmark[row], LANDMARKS
             if isinstance(target, str) and target in self.given.robots:
                 target, group = self._node(target, scan.t_ns), POSES
-            self.sighted.setdefault((scan.robot, scan.sensor, group), []).append(Seen(node, target, y, R_row, row))
+            self.sighted.setdefault((scan.robot, scan.sensor, group), []).append(
+                BatchObservation(node, target, y, R_row, row)
+            )
 
     def _noise(self, scan: Scan, sensor: Sensor, rows: list[int]) -> Array:
         """Return the noise R of a scan's rows as in the filter: where it varies, that of what was expected."""
@@ -248,7 +250,7 @@ class Replay:
         values = np.array([self._value(name, poses) for name in names]).reshape(-1, space.size)
         seen, mounts = self._sightings({name: k for k, name in enumerate(names)})
         spaces = (POSE_SPACES[size], space, *(mount_space(size) for _ in mounts))
-        state = State(spaces, (poses, values, *(mean[None] for mean in mounts)))
+        state = BatchState(spaces, (poses, values, *(mean[None] for mean in mounts)))
         exactly = np.array([name in self.known and self.known[name][1] is None for name in names], dtype=np.bool_)
         held = NONE if given.motion else _first_poses(seen, len(poses), exactly)
         free = np.ones(state.ends[-1], dtype=np.bool_)
@@ -299,7 +301,7 @@ class Replay:
             factors.append(sightings(view, tuple(blocks), y, R, huber, (robot, sensor)))
         return factors, [np.array(given.mounts[name], dtype=np.float64) for name in groups]
 
-    def _anchors(self, seen: list[Factor], state: State) -> tuple[list[Factor], Ints]:
+    def _anchors(self, seen: list[Factor], state: BatchState) -> tuple[list[Factor], Ints]:
         """Return the factors of where the anchors of walls are along them, and which landmarks are points.
 
         It is where the start has them, from the pose of their first sighting.

@@ -16,7 +16,7 @@ from kalmark.events import Control
 from kalmark.geometry import frames, frames3d
 from kalmark.models.observe import composed
 from kalmark.models.protocols import Motion, SelfCalibrating, calibrating, true_control
-from kalmark.slam.held_control import HeldInput, Part
+from kalmark.slam.held_control import HeldInput, MotionPart
 
 if TYPE_CHECKING:
     from kalmark.slam.robot import Robot
@@ -88,7 +88,7 @@ class Course:
         self.drive, self.moves, self.known = HeldInput(self.motion, gaps), 1, False
         self.Q[-1] = ANYWHERE**2 * np.eye(len(self.T))
 
-    def add(self, part: Part, roots: list[Array]) -> None:
+    def add(self, part: MotionPart, roots: list[Array]) -> None:
         """Move by one part.  The error of a control that scans split is kept out of Q, with a root of N in `roots`."""
         self.moves += 1
         self.moved, F, R_u = self.motion.move(self.moved, self._control(part), part.dt_s)
@@ -110,13 +110,13 @@ class Course:
                 axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
                 self.Q[-1] += axes @ D @ axes.T
 
-    def _control(self, part: Part) -> Array:
+    def _control(self, part: MotionPart) -> Array:
         """Return the control of a part, as it is with the constants that are known."""
         if self.bias is None or not isinstance(self.motion, SelfCalibrating):
             return part.u
         return true_control(self.motion, part.u, self.bias, part.dt_s)[0]
 
-    def _stay(self, part: Part, F: Array, R_u: Array) -> None:
+    def _stay(self, part: MotionPart, F: Array, R_u: Array) -> None:
         """Carry the systematic errors on, in the order of `systematic_errors`."""
         k, T = len(part.u), F @ self.T
         T[:, :k] += R_u if self.motion.held else R_u * part.dt_s

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import ORIGIN, POSE_SPACES, POSES, Ints, State, beyond, looked, plus
+from kalmark.batch.batch_state import ORIGIN, POSE_SPACES, POSES, BatchState, Ints, beyond, looked, plus
 from kalmark.events import Id
 from kalmark.geometry.spaces import POINT2, POINT3, Space
 
@@ -41,16 +41,16 @@ class Term:
     residuals: Callable[..., tuple[Array, Array]]
     blocks: tuple[Block, ...]
 
-    def at(self, state: State) -> tuple[Array, Array]:
+    def at(self, state: BatchState) -> tuple[Array, Array]:
         """Return the residuals and E at a state; NaN where a sensor does not see its target."""
         return self.residuals(*self._values(state))
 
-    def jacobian(self, E: Array, state: State) -> sp.csr_array:
+    def jacobian(self, E: Array, state: BatchState) -> sp.csr_array:
         """Return E (K, p, .) as a sparse matrix (K p, size of a step)."""
         k, p, _ = E.shape
         return _sparse(E, np.arange(k * p).reshape(k, p), self._columns(state), (k * p, state.ends[-1]))
 
-    def hessian(self, state: State, weighed: Callable[[Array], Array]) -> sp.csr_array:
+    def hessian(self, state: BatchState, weighed: Callable[[Array], Array]) -> sp.csr_array:
         """Return the derivative of the gradient -E' weighed(z), by central differences; symmetric, as turns are not."""
         values, columns = self._values(state), []
         for k, (x, block) in enumerate(zip(values, self.blocks, strict=True)):
@@ -64,10 +64,10 @@ class Term:
         C, at = np.stack(columns, axis=2), self._columns(state)
         return _sparse(0.5 * (C + C.swapaxes(1, 2)), at, at, (state.ends[-1],) * 2)
 
-    def _values(self, state: State) -> list[Array]:
+    def _values(self, state: BatchState) -> list[Array]:
         return [state.groups[group][rows, : space.size] for group, rows, space in self.blocks]
 
-    def _columns(self, state: State) -> Ints:
+    def _columns(self, state: BatchState) -> Ints:
         """Return where in a step the errors (K, .) of all blocks are."""
         return np.concatenate(
             [state.columns(b.group, b.rows)[:, None] + np.arange(b.space.dof) for b in self.blocks], 1
@@ -96,7 +96,7 @@ class Factor:
     sensor: tuple[str, str] = ("", "")
     view: Any = None
 
-    def rows(self, state: State) -> Rows:
+    def rows(self, state: BatchState) -> Rows:
         """Return the whitened residuals and what they sum up to."""
         z, E = self.term.at(state)
         L_inverse = np.linalg.inv(np.linalg.cholesky(self.R))
@@ -108,7 +108,7 @@ class Factor:
             z, E = root * z, root[:, :, None] * E
         return Rows(z.ravel(), self.term.jacobian(E, state), float(inside @ (2 * length - inside)))
 
-    def hessian(self, state: State) -> sp.csr_array:
+    def hessian(self, state: BatchState) -> sp.csr_array:
         """Return the second derivative of |z|^2 / 2, not robust."""
         weights = np.asarray(np.linalg.inv(self.R), dtype=np.float64)
         return self.term.hessian(state, lambda z: np.einsum("kij,kj->ki", weights, z))
@@ -187,7 +187,7 @@ def motions(
 class Linearized(NamedTuple):
     """A problem at a state: whitened residuals z and H, their `chi2`, the motion's errors w and their Jacobian J."""
 
-    state: State
+    state: BatchState
     z: Array
     H: sp.csr_array
     chi2: float
@@ -206,13 +206,13 @@ class Problem:
     motions: Motions
     factors: tuple[Factor, ...]
     free: Flags
-    start: State
+    start: BatchState
     ids: list[Id]
     nodes: Ints
     robots: list[str]
     kind: str
 
-    def at(self, state: State) -> Linearized:
+    def at(self, state: BatchState) -> Linearized:
         """Return the problem linearised at a state."""
         rows = [factor.rows(state) for factor in self.factors]
         z = np.concatenate([np.empty(0), *(r.z for r in rows)])
@@ -221,13 +221,13 @@ class Problem:
         J = self.motions.term.jacobian(-E, state)
         return Linearized(state, z, H, sum(r.chi2 for r in rows), w.ravel(), J)
 
-    def hessian(self, state: State, multipliers: Array) -> sp.csr_array:
+    def hessian(self, state: BatchState, multipliers: Array) -> sp.csr_array:
         """Return the second derivative of the Lagrangian |z|^2 / 2 + m' w."""
         total = self.motions.term.hessian(state, lambda w: multipliers.reshape(w.shape))
         for factor in self.factors:
             total = sp.csr_array(total + factor.hessian(state))
         return total
 
-    def left(self, state: State) -> list[tuple[str, Array]]:
+    def left(self, state: BatchState) -> list[tuple[str, Array]]:
         """Return what a state leaves of each sensor's measurements, (K, p); NaN where a landmark is not in view."""
         return [(factor.sensor[1], factor.term.at(state)[0]) for factor in self.factors if factor.sensor[1]]

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from kalmark.arrays import Array, Flags
 from kalmark.association.gated import assigned
 from kalmark.batch.batch_state import LANDMARKS, Ints, looked
-from kalmark.batch.data import Replay
+from kalmark.batch.data import BatchReplay
 from kalmark.batch.solver import Batch, optimum
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
@@ -55,7 +55,7 @@ class Reassociated:
     settled: bool
 
 
-def reassociated(replay: Replay, may_change: Flags, numbers: Iterable[int] = range(1, ROUNDS + 1)) -> Reassociated:
+def reassociated(replay: BatchReplay, may_change: Flags, numbers: Iterable[int] = range(1, ROUNDS + 1)) -> Reassociated:
     """Decide again which landmark the observations (O,) are of that `may_change`, beginning at those of the replay.
 
     Takes a round a number of `numbers` until nothing changes, each of O(observations log landmarks) beside the optimum.
@@ -107,7 +107,7 @@ class _Seen(NamedTuple):
 class _Look:
     """How the observations look from the poses of a solution."""
 
-    def __init__(self, replay: Replay, batch: Batch, may_change: Flags) -> None:
+    def __init__(self, replay: BatchReplay, batch: Batch, may_change: Flags) -> None:
         self.scan, self.ids = replay.given.associations.scan, batch.ids
         self.landmarks: dict[Id, Array] = dict(zip(batch.ids, batch.means, strict=True))
         self.seen = [
@@ -190,7 +190,7 @@ class _Look:
         return found
 
 
-def _seen(replay: Replay, batch: Batch, key: tuple[str, str, int], may_change: Flags) -> list[_Seen]:
+def _seen(replay: BatchReplay, batch: Batch, key: tuple[str, str, int], may_change: Flags) -> list[_Seen]:
     """Return the observations of one sensor that may change, if they determine places."""
     given, (robot, sensor, _) = replay.given, key
     mount = given.robots[robot].sensors[sensor]

@@ -27,7 +27,7 @@ from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import LANDMARKS, POSES, Ints, State, unsolved
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState, Ints, unsolved
 from kalmark.batch.problem import Linearized, Problem
 from kalmark.errors import KalmarkError
 from kalmark.events import Id
@@ -50,7 +50,7 @@ class Batch:
 
     ids: list[Id]
     nodes: Ints
-    state: State
+    state: BatchState
     joint: Array
     chi2: float
     dof: int
@@ -79,7 +79,11 @@ class Batch:
 
 
 def optimum(
-    problem: Problem, start: State | None = None, *, iterations: Iterable[int] = range(1, 101), tolerance: float = 1e-9
+    problem: Problem,
+    start: BatchState | None = None,
+    *,
+    iterations: Iterable[int] = range(1, 101),
+    tolerance: float = 1e-9,
 ) -> Batch:
     """Find the maximum-likelihood path and map: O(steps) and O(landmarks^3) each of the `iterations`.
 
@@ -100,7 +104,7 @@ def optimum(
 class _Search:
     """Where the search stands: the problem there, the multipliers of the motion, the penalty (q,) on its violation."""
 
-    def __init__(self, problem: Problem, start: State) -> None:
+    def __init__(self, problem: Problem, start: BatchState) -> None:
         _refuse_hidden(problem, start)
         self.problem, self.at, self.size = problem, problem.at(start), np.inf
         self.damping, self.flat = 0.0 if len(self.at.w) else DAMPING, False
@@ -148,7 +152,7 @@ class _Search:
         return self.cost(at, multipliers) + float(self.penalty @ defect)
 
 
-def _refuse_hidden(problem: Problem, start: State) -> None:
+def _refuse_hidden(problem: Problem, start: BatchState) -> None:
     """Raise KalmarkError if a state does not show a sensor what it saw."""
     for factor in problem.factors:
         hidden = np.flatnonzero(np.isnan(factor.term.at(start)[0]).any(axis=1))

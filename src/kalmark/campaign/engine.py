@@ -38,7 +38,7 @@ from kalmark.models.sensors import RangeBearing
 from kalmark.results.measures import MAP_NEES, in_log, map_nees
 from kalmark.simulate.robots import Chance, drawn_start, scenery_of
 from kalmark.simulate.routes import Constant, Drive
-from kalmark.simulate.sights import POINTS, Sensing, Things, chosen
+from kalmark.simulate.sights import POINTS, SimulatedSensing, Things, chosen
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
@@ -81,7 +81,7 @@ def refusal(world: Any, configs: Mapping[str, Config]) -> str:
     robot = build_robot(world.models(), name)
     ((key, mount),) = robot.sensors.items()
     why = _odd_models(robot.motion, mount)
-    sensing = simulated.sensing.get(key, Sensing())
+    sensing = simulated.sensing.get(key, SimulatedSensing())
     if not why and (sensing.outliers or sensing.swapped or sensing.hidden):
         why = "the batched engine simulates no outliers, swapped or hidden ids"
     if not why and not isinstance(simulated.route, Constant | Drive):
@@ -220,7 +220,7 @@ def in_sight(
 
 
 def reported(
-    world: World, sensing: Sensing, things: Things, noise: Noise, chance: Chance, seen: Sightings
+    world: World, sensing: SimulatedSensing, things: Things, noise: Noise, chance: Chance, seen: Sightings
 ) -> Sightings:
     """Return what is reported of all that is seen, with noise: as `sights.chosen`, `faulty`, `noisy` and `possible`."""
     steps, numbers, e = seen
@@ -469,7 +469,7 @@ class Engine:
         ((name, simulated),) = world.robots.items()
         self.robot, self.route = build_robot(world.models(), name), simulated.route
         ((key, self.mount),) = self.robot.sensors.items()
-        self.sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
+        self.sensing = simulated.sensing.get(key, SimulatedSensing()).of(simulated.sensors[key], world.dt_s)
         things = scenery_of(world, np.random.default_rng(0))
         self.landmarks = len(things[POINTS].values)
         self.filters = {label: _Filter(build_slam(c), name, self.landmarks) for label, c in configs.items()}

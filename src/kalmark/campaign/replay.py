@@ -38,7 +38,7 @@ from kalmark.results.recording import config_yaml
 from kalmark.results.warnings import NO_ID
 from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start, told
 from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
-from kalmark.slam.held_control import HeldInput, Part, noise_of
+from kalmark.slam.held_control import HeldInput, MotionPart, noise_of
 from kalmark.slam.robot import Robot
 from kalmark.slam.slam import Slam
 
@@ -255,7 +255,7 @@ class _Driven:
         if part is not None:
             self.move(part, rng)
 
-    def move(self, part: Part, rng: Generator) -> None:
+    def move(self, part: MotionPart, rng: Generator) -> None:
         """Move by a part of a control; what it diffuses is that of the control that the filter knows."""
         self.state, *_ = self.motion.move(self.state, part.u, part.dt_s)
         self.state = diffused(self.motion, self.state, self.told, part.dt_s, rng)

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import Ints, State
-from kalmark.batch.data import Associations, Given, replayed
+from kalmark.batch.batch_state import BatchState, Ints
+from kalmark.batch.data import Associations, BatchInput, replayed
 from kalmark.batch.problem import Problem
 from kalmark.batch.solver import Batch, optimum
 from kalmark.diagnosis import repeated_events
@@ -46,7 +46,7 @@ class Searched(NamedTuple):
 
     search: Search
     batch: Batch
-    given: Given
+    given: BatchInput
     pulled: bool = False
 
 
@@ -77,7 +77,7 @@ def searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searc
     return Searched(search, batch, given)
 
 
-def searched_robustly(run: Run, log: Log, given: Given, progress: bool) -> Searched | None:
+def searched_robustly(run: Run, log: Log, given: BatchInput, progress: bool) -> Searched | None:
     """Search for causes from a robust solution, with what is far off there taken out first; None if it has none."""
     problem = replayed(given, log)
     batch = robust(problem, problem.start)
@@ -89,7 +89,7 @@ def searched_robustly(run: Run, log: Log, given: Given, progress: bool) -> Searc
     return Searched(search, batch, given, pulled=True)
 
 
-def regated(run: Run, log: Log, given: Given) -> Given:
+def regated(run: Run, log: Log, given: BatchInput) -> BatchInput:
     """Return it with the path and the map of the log filtered again with a gate: what is far off pulls these less."""
     if (run.config.get("association") or {}).get("type") != "identity":
         return given
@@ -100,7 +100,7 @@ def regated(run: Run, log: Log, given: Given) -> Given:
     return replace(given, poses=given_by(again).poses, landmarks={**given.landmarks, **filtered_map(again)})
 
 
-def robust(problem: Problem, state: State) -> Batch | None:
+def robust(problem: Problem, state: BatchState) -> Batch | None:
     """Return the solution in which observations beyond fewer and fewer sigmas count less, from a state on, if any."""
     found = None
     for huber in HUBER:
@@ -111,7 +111,7 @@ def robust(problem: Problem, state: State) -> Batch | None:
     return found
 
 
-def once(run: Run, given: Given) -> Given:
+def once(run: Run, given: BatchInput) -> BatchInput:
     """Return it without the scans that are copies of the one before."""
     twice = np.unique(run.history.step[repeated_events.of_scans(run)])
     used = given.associations
@@ -124,7 +124,7 @@ def _rows(used: Associations, rows: Ints) -> Associations:
     return Associations(used.scan[rows], used.sensor[rows], used.index[rows], names, used.e[rows])
 
 
-def calibrated(run: Run, given: Given) -> Given:
+def calibrated(run: Run, given: BatchInput) -> BatchInput:
     """Return it with the mounts, ranges and controls that calibrate themselves as they were in the end."""
     slam, robots = run.final_slam(), {}
     for name, robot in given.robots.items():
@@ -170,7 +170,7 @@ def within_gates(run: Run) -> dict[Where, Array]:
     return found
 
 
-def thinned(run: Run, given: Given, most: int) -> Given:
+def thinned(run: Run, given: BatchInput, most: int) -> BatchInput:
     """Return about `most` of the observations: segments of successive scans, evenly over the run.
 
     Those with the scans that fit least are among them, if these do not fit by chance: a jump is a single step.

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from kalmark.arrays import Array
 from kalmark.batch.batch_state import LANDMARKS
-from kalmark.batch.data import Given
+from kalmark.batch.data import BatchInput
 from kalmark.batch.problem import sightings
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
@@ -30,7 +30,7 @@ MOVED_M = 1e-5  # of a mount, for its derivative
 
 
 def calibrations(
-    run: Run, linear: Linear, given: Given, keys: Keys, sure: set[Path_]
+    run: Run, linear: Linear, given: BatchInput, keys: Keys, sure: set[Path_]
 ) -> tuple[list[Finding], dict[Path_, str]]:
     """Return the calibrations that are off, and of those that the log cannot tell from another error, from which.
 
@@ -67,7 +67,7 @@ def calibrations(
     return found, alike
 
 
-def _mounts(linear: Linear, given: Given) -> Iterator[Column]:
+def _mounts(linear: Linear, given: BatchInput) -> Iterator[Column]:
     """Yield what a sensor that sits elsewhere adds to the data, by each coordinate of its place, in 1/m."""
     none, d = np.zeros(len(linear.at.w)), linear.state.d
     for f, factor in enumerate(linear.problem.factors):

@@ -18,8 +18,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import State
-from kalmark.batch.data import Given, replayed
+from kalmark.batch.batch_state import BatchState
+from kalmark.batch.data import BatchInput, replayed
 from kalmark.batch.problem import Motions, Problem
 from kalmark.diagnosis.causes import BLOCKS
 from kalmark.diagnosis.linear import Left, Linear
@@ -101,7 +101,7 @@ def _with(robot: Robot, path: tuple[str, ...], value: float) -> Robot:
 class Components:
     """The noises of a run, and what each adds to the covariances of the data `given` with the events of a log."""
 
-    def __init__(self, given: Given, log: Log, state: State, noises: Sequence[Noise]) -> None:
+    def __init__(self, given: BatchInput, log: Log, state: BatchState, noises: Sequence[Noise]) -> None:
         robots = with_noise(given.robots, {noise: noise.scale for noise in noises})
         self.given, self.log, self.state = replace(given, robots=robots), log, state
         self.first = first = self._problem({})

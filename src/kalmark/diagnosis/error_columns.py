@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import POSES, Ints, State
+from kalmark.batch.batch_state import POSES, BatchState, Ints
 from kalmark.batch.problem import Factor
 from kalmark.diagnosis.linear import Linear
 from kalmark.geometry.angles import rotation
@@ -76,7 +76,7 @@ def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates:
 
 
 def _of_sensor(
-    factor: Factor, state: State, names: tuple[str, ...], rates: Array
+    factor: Factor, state: BatchState, names: tuple[str, ...], rates: Array
 ) -> Iterator[tuple[str, tuple[str, ...], str, Array]]:
     """Yield the name, the place and the unit of each error of a sensor, and what it adds to its innovations (K, p)."""
     z, E = factor.term.at(state)

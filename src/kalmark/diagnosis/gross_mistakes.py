@@ -28,7 +28,7 @@ from kalmark.logs.progress import track
 from kalmark.report import ALONE
 from kalmark.results.control_gaps import while_lost
 from kalmark.results.figure_texts import figure
-from kalmark.results.history import Start
+from kalmark.results.history import RobotStart
 from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_robust, rmse
 from kalmark.results.record import record
 from kalmark.results.run import Run
@@ -269,7 +269,7 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
     return Mistake("start", evidence, cure, config, None, gain, begin_s)
 
 
-def _onto_its_fixes(run: Run, log: Log, events: list[Event], start: Start) -> tuple[Rigid, Array, float] | None:
+def _onto_its_fixes(run: Run, log: Log, events: list[Event], start: RobotStart) -> tuple[Rigid, Array, float] | None:
     """Return what moves the path of a robot alone onto its fixes, these (N, d), and their variance, m^2.
 
     None if the path fits them nearly as well as it is: then it was another robot that started elsewhere.
@@ -308,7 +308,7 @@ def _alone(events: list[Event], robot: str, robots: Sequence[str]) -> Iterator[E
 
 
 def started_at(
-    config: Mapping[str, Any], start: Start, onto: Rigid, fixes: Array, variance: float
+    config: Mapping[str, Any], start: RobotStart, onto: Rigid, fixes: Array, variance: float
 ) -> tuple[dict[str, Any], str, str]:
     """Return a configuration with a start that is moved, and that in words and as a line that makes it.
 

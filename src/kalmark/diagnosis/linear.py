@@ -19,7 +19,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import LANDMARKS, POSES, Ints, State
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState, Ints
 from kalmark.batch.problem import Factor, Linearized, Problem
 from kalmark.batch.solver import Reduced, followers
 
@@ -67,14 +67,14 @@ class Linear:
     within: Mapping[tuple[str, str], Array]
 
     @classmethod
-    def of(cls, problem: Problem, state: State, within: Mapping[tuple[str, str], Array] | None = None) -> Linear:
+    def of(cls, problem: Problem, state: BatchState, within: Mapping[tuple[str, str], Array] | None = None) -> Linear:
         """Return the problem at a state, as it is."""
         at, r = problem.at(state), problem.motions.root.shape[1]
         none = np.zeros(len(at.z)), np.zeros(len(at.w))
         return cls(problem, at, np.ones(len(at.z)), np.ones(r), *none, within or {})
 
     @property
-    def state(self) -> State:
+    def state(self) -> BatchState:
         """Where it is linear."""
         return self.base.state
 
@@ -158,7 +158,7 @@ class Linear:
         """Which residuals (N,) still count."""
         return self.noise < OUT
 
-    def moved(self) -> State:
+    def moved(self) -> BatchState:
         """Return the state at which the data as they are have their optimum."""
         return self.state.moved(self.reduced.step()[0], followers(self.at))
 

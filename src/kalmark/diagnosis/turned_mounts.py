@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import LANDMARKS, POSES, State
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
 from kalmark.batch.problem import Factor
 from kalmark.diagnosis.causes import LEAST_INFORMATION, SEEN, SHOWS, Finding, systematic
 from kalmark.diagnosis.error_columns import Column
@@ -61,7 +61,7 @@ def _turns(linear: Linear, f: int, factor: Factor) -> Iterator[Array]:
         yield linear.whitened(parts)
 
 
-def _axes(state: State, factor: Factor) -> Iterator[Array]:
+def _axes(state: BatchState, factor: Factor) -> Iterator[Array]:
     """Yield how a robot would move (K, dof), about its sensor, to see what the sensor sees if that turns."""
     block, mount = factor.term.blocks[0], factor.view[MOUNT] if isinstance(factor.view, tuple) else factor.view.mount
     poses = state.groups[POSES][block.rows]

@@ -33,7 +33,7 @@ from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst
 from kalmark.results.control_gaps import RULED_OUT, left_out, matters, stayed_lost
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.gauge import shape_of_points
-from kalmark.results.history import Placed
+from kalmark.results.history import RelocatedRobot
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
@@ -376,7 +376,7 @@ def _lost(run: Run) -> Iterator[Cause]:
         yield Cause("lost", one.since_s, 0.5 * MOST_D2 * one.number, evidence, cure)
 
 
-def _left_out_until(run: Run, placed: Sequence[Placed]) -> float:
+def _left_out_until(run: Run, placed: Sequence[RelocatedRobot]) -> float:
     """Return half of the chi-square of the readings that moved a robot: those left out in a row until it was moved."""
     h, now, score = run.history, fit(run), 0.0
     of = (h.robot[h.step] == placed[0].robot) & (h.sensor == placed[0].sensor)

@@ -19,7 +19,8 @@ from kalmark.filter.inertial_errors import has_units, turn_own_errors
 from kalmark.filter.map import Map, StochasticMap
 
 __all__ = [
-    "Averaging", "Compiling", "Correction", "Ekf", "Estimator", "Fej", "Invariant", "Iterating", "Movement", "Update",
+    "Averaging", "CompilingEstimator", "Correction", "Ekf", "Estimator", "Fej", "Invariant", "Iterating", "Movement",
+    "Update",
 ]  # fmt: skip
 
 
@@ -96,7 +97,7 @@ class Estimator(Protocol):
 
 
 @runtime_checkable
-class Compiling(Protocol):
+class CompilingEstimator(Protocol):
     """An estimator that is compiled, and can begin with that before it is needed."""
 
     def compile_ahead(self, axes: int, inverse_depths: bool) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import Probability, Within, register
 from kalmark.geometry.spaces import POINT2
-from kalmark.management.pending import OTHERS, Correction, Step
+from kalmark.management.pending import OTHERS, HypothesisCorrection, Step
 from kalmark.models.landmarks import Polar2D
 from kalmark.models.observe import linearize
 from kalmark.tracks.scan import ScanContext, Start
@@ -105,7 +105,7 @@ class Hypotheses:
         return [Start(POLAR, np.array([*T[:2], turn, distance]), parts, G, Q) for turn in turns.tolist()]
 
 
-def _corrected(scan: ScanContext, slot: int, k: int) -> tuple[Correction, float]:
+def _corrected(scan: ScanContext, slot: int, k: int) -> tuple[HypothesisCorrection, float]:
     """Return the correction of one hypothesis alone by a range, and the logarithm of its likelihood."""
     map_, channel, robot = scan.map, scan.channel, scan.robot
     parts = (*channel.parts(map_, robot), (slot, 4))
@@ -131,7 +131,7 @@ def _corrected(scan: ScanContext, slot: int, k: int) -> tuple[Correction, float]
         F[h:, 2:3] += POLAR.generator(moved) - POLAR.generator(l)
     given = S[:h, :h] - S[:h, h:] @ np.linalg.pinv(S[h:, h:], rcond=1e-10, hermitian=True) @ S[h:, :h]
     white = noise / (noise + max(0.0, float(H[0, :h] @ given @ H[0, :h])))
-    return Correction(slot, parts, F, Q, moved), -0.5 * white * (v**2 / Z + math.log(Z))
+    return HypothesisCorrection(slot, parts, F, Q, moved), -0.5 * white * (v**2 / Z + math.log(Z))
 
 
 def _second_derivative(T: Array, l: Array, E_p: Array, P_l: Array) -> float:

@@ -61,7 +61,7 @@ class Merge(NamedTuple):
     ratio: float
 
 
-class Search:
+class MergeSearch:
     """Which landmarks to compare after a scan: those observed in it, and what is covisible with merged ones."""
 
     def __init__(self, tracks: Tracks, observed: Sequence[Id]) -> None:

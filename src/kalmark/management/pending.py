@@ -17,7 +17,7 @@ from kalmark.tracks.track import Pending
 OTHERS = "another sensor's ranges of it are being kept"
 
 
-class Correction(NamedTuple):
+class HypothesisCorrection(NamedTuple):
     """The correction of one hypothesis alone (Schmidt's filter): P <- F P F' + Q on the rows of the parts."""
 
     slot: int
@@ -39,7 +39,7 @@ class Step(NamedTuple):
     outcome: str
     reason: str
     pending: Pending | None = None
-    corrections: tuple[Correction, ...] = ()
+    corrections: tuple[HypothesisCorrection, ...] = ()
     added: tuple[Start, ...] = ()
     keep: bool = False
     removed: tuple[int, ...] = ()

@@ -54,7 +54,7 @@ class Fits(NamedTuple):
     R: Array
 
 
-class Problem(NamedTuple):
+class RangeProblem(NamedTuple):
     """How positions (J, 2) fit ranges from the sensor's places (n, 2), and the blocks that those depend on.
 
     `S` is the covariance of the sensor's k own parameters and its places, `S_x` (k + 2 n, .) their Jacobian.
@@ -149,7 +149,7 @@ def _varies(scan: ScanContext, m: Measurement) -> bool:
     return scan.channel.noise_at is not None and not m.own_noise
 
 
-def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> Problem:
+def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> RangeProblem:
     """Return the problem whose solution is the position of the landmark."""
     map_, channel, n = scan.map, scan.channel, len(kept)
     sensor, clones = channel.calibrated(map_), [scan.clones[m.clone] for m in kept]
@@ -185,7 +185,7 @@ def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> Problem:
         chi2 = np.einsum("ji,jik,jk->j", z, inverse, z)
         return Fits(l, chi2 + np.linalg.slogdet(Sigma)[1], chi2, z, H, H_x, inverse, R)
 
-    return Problem(slots, S_x, S, fit, places)
+    return RangeProblem(slots, S_x, S, fit, places)
 
 
 def _search(fit: Callable[[Array], Fits], starts: Array) -> Fits:
@@ -206,7 +206,7 @@ def _search(fit: Callable[[Array], Fits], starts: Array) -> Fits:
     return now
 
 
-def _flat(best: Fits, problem: Problem) -> bool:
+def _flat(best: Fits, problem: RangeProblem) -> bool:
     """Return whether circles are as good as straight within a sigma of the position, as seen from the places.
 
     An error that all places have in common does not bend a circle: the position is taken relative to them, its errors

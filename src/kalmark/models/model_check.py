@@ -36,7 +36,7 @@ FACING = np.array([0.0, 0.0, 1.0, np.cos(0.3), 0.0, 0.0, -np.sin(0.3)])  # tilte
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """The result of one check: the largest difference, relative to 1 + the value, and where it was."""
 
     what: str
@@ -49,7 +49,7 @@ class Finding:
         return self.error <= TOLERANCE
 
 
-def check_model(model: Any, rng: Rng) -> list[Finding]:
+def check_model(model: Any, rng: Rng) -> list[CheckResult]:
     """Return one finding for each promise of a motion, sensor or landmark model, or of a function.
 
     A function f(x, ...) returns a value and its Jacobians in its arguments, in their order.  Raises ModelError if it is
@@ -268,7 +268,7 @@ def _from_pose(model: Any, rng: Rng, found: _Findings) -> None:
     found.jacobian("V_l", V_l, lambda x: model.seen_from(T, x)[0], l, space, view, at)
     if isinstance(model, protocols.Reparametrizable):
         found.jacobian("P_l of to_point", model.to_point(l)[1], lambda x: model.to_point(x)[0], l, space, where, at)
-    if isinstance(model, protocols.Placed):
+    if isinstance(model, protocols.HasPlace):
         found.jacobian("P_l of place", model.place(l)[1], lambda x: model.place(x)[0], l, space, where, at)
     if "from_view" not in dir(model):
         return
@@ -363,7 +363,7 @@ def _differences(f: Batch, x: Array, of: Space, to: Space, h: float) -> Array:
 class _Findings:
     """The worst finding of each kind so far."""
 
-    worst: dict[str, Finding] = field(default_factory=dict)
+    worst: dict[str, CheckResult] = field(default_factory=dict)
 
     def jacobian(self, what: str, J: Any, f: Batch, x: Array, of: Space, to: Space, at: dict[str, Any]) -> None:
         """Compare J (K, to.dof, of.dof) with the differences of f at x (K, of.size)."""
@@ -395,7 +395,7 @@ class _Findings:
         i = int(np.argmax(error))
         if what not in self.worst or error[i] > self.worst[what].error:
             where = ", ".join(f"{name} = {_show(x[i])}" for name, x in at.items())
-            self.worst[what] = Finding(what, float(error[i]), where or "the model")
+            self.worst[what] = CheckResult(what, float(error[i]), where or "the model")
 
 
 def _finite(what: str, y: Array, x: Array) -> Any:

@@ -545,7 +545,7 @@ class Joining(Segmented, Protocol):
 
 
 @runtime_checkable
-class Placed(Protocol):
+class HasPlace(Protocol):
     """A landmark that is somewhere."""
 
     def place(self, l: Array) -> tuple[Array, Array]:
@@ -558,7 +558,7 @@ def place_of(landmark: Landmark, l: Array) -> tuple[Array, Array] | None:
     By default that is the vector with which the landmark's space begins.  None if it begins with something else, or
     has an inverse distance: then the vector is an anchor.
     """
-    if isinstance(landmark, Placed):
+    if isinstance(landmark, HasPlace):
         return landmark.place(l)
     kinds = landmark.space.kinds
     size = None if RHO in kinds else {VECTOR: 2, VECTOR3: 3}.get(kinds[0])
@@ -577,7 +577,7 @@ _OF: dict[type, tuple[type, ...]] = {
         _InnovationSize, _NamesParameters, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous,
         FarCorrected, OwnNoise, StartNoise, Checked, SeesVelocity, OfState, TimedNoise, Drifting,
     ),
-    Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Joining, Placed),
+    Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Joining, HasPlace),
 }  # fmt: skip
 _NEAR = 0.85  # of difflib: "see" is near "sees", "extent" is not near "extend"
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.batch.batch_state import LANDMARKS, POSES, State
-from kalmark.batch.data import Associations, Given, Known, Replay, replayed
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
+from kalmark.batch.data import Associations, BatchInput, BatchReplay, Known, replayed
 from kalmark.batch.problem import Problem
 from kalmark.batch.reassociation import ROUNDS, Reassociated, reassociated
 from kalmark.batch.solver import Batch, optimum
@@ -27,7 +27,7 @@ from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
 from kalmark.models.protocols import Landmark, OfState, SeesVelocity
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
-from kalmark.results.history import History, Start, as_id
+from kalmark.results.history import History, RobotStart, as_id
 from kalmark.results.landmark_table import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
 from kalmark.results.restarts import Restart, restarts
@@ -104,7 +104,7 @@ def second_opinion(run: Recording, log: Log | Iterable[Event], *, known: Known |
     rows = np.flatnonzero(run.history.fused | open_)
     given = given_by(run, known, rows)
     numbers = track(range(1, ROUNDS + 1), "second opinion: round of association")
-    found = reassociated(Replay.of(given, log), open_[rows], numbers)
+    found = reassociated(BatchReplay.of(given, log), open_[rows], numbers)
     changed = added = left_out = 0
     made_of: dict[Id, list[bool]] = {name: [] for name in found.new}
     for before, after in zip(given.associations.landmark, found.landmark, strict=True):
@@ -123,7 +123,7 @@ def solve_batch(
     log: Log | Iterable[Event],
     *,
     known: Known | None = None,
-    initial: State | None = None,
+    initial: BatchState | None = None,
     iterations: int = 100,
     progress: bool = True,
 ) -> Batch:
@@ -139,7 +139,7 @@ def solve_batch(
     return optimum(problem, initial, iterations=steps)
 
 
-def given_by(run: Recording, known: Known | None = None, rows: Index | None = None) -> Given:
+def given_by(run: Recording, known: Known | None = None, rows: Index | None = None) -> BatchInput:
     """Return what the batch solution needs of a run: of the observations exactly those that the filter used.
 
     With `rows` of the history these are read; those that the filter did not use are of no landmark.
@@ -170,7 +170,7 @@ def given_by(run: Recording, known: Known | None = None, rows: Index | None = No
                 what = f"landmark {str(name)!r} was in the map beforehand"
                 raise KalmarkError(f"batch solution: {what}, expected its mean and covariance in `known`")
             beforehand[name] = (mean, None)
-    return Given(
+    return BatchInput(
         robots=robots,
         landmark=_point(slam),
         t_ns=history.t_ns,
@@ -200,7 +200,7 @@ def _moved(history: History, again: Mapping[str, Restart]) -> Array:
     return poses
 
 
-def _start(start: Start, again: Restart | None) -> tuple[Array, Array]:
+def _start(start: RobotStart, again: Restart | None) -> tuple[Array, Array]:
     """Return mean and covariance of a robot at its start; a start that was wrong says nothing."""
     if again is None:
         return start.mean, start.covariance
@@ -301,7 +301,7 @@ def tag_problem(run: Recording) -> Problem:
     steps, first, scan = np.unique(history.step[rows], return_index=True, return_inverse=True)
     names, index = [ids[name] for name in history.landmark[rows].tolist()], np.arange(len(rows)) - first[scan]
     t_ns, robot, sensor = history.t_ns[steps], history.robot[steps], history.sensor[rows]
-    given = Given(
+    given = BatchInput(
         robots=slam.robots,
         landmark=Tag(),
         t_ns=t_ns,

@@ -18,7 +18,7 @@ from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth
 from kalmark.report import Candidate
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.filter_description import mount_now
-from kalmark.results.history import Change, History, Ints
+from kalmark.results.history import History, Ints, LandmarkChange
 from kalmark.results.landmark_table import LINE
 from kalmark.results.recording import Recording
 from kalmark.results.truth import as_rigid
@@ -69,7 +69,7 @@ class Explanation:
     covariance: Array
     gates: tuple[float, float] | None
     fates: tuple[Fate, ...]
-    changes: tuple[Change, ...]
+    changes: tuple[LandmarkChange, ...]
     asked: str = ""
 
     def lines(self) -> Iterator[str]:

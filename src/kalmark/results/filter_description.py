@@ -16,7 +16,7 @@ from kalmark.logs.log import Log
 from kalmark.models.protocols import calibrating, parameter_names
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
-from kalmark.results.history import Biased, Camera, Measuring, Mounted
+from kalmark.results.history import Biased, CalibratedMount, Camera, Measuring
 from kalmark.slam.description import describe
 from kalmark.slam.held_control import bias_name
 
@@ -83,11 +83,13 @@ def sensors(slam: Slam) -> tuple[Measuring, ...]:
     )
 
 
-def mounts(slam: Slam) -> tuple[Mounted, ...]:
+def mounts(slam: Slam) -> tuple[CalibratedMount, ...]:
     """Return the mounts of the sensors that calibrate themselves, as estimated and as given."""
     named = {f"{robot.name}.{key}": mount for robot in slam.robots.values() for key, mount in robot.sensors.items()}
     return tuple(
-        Mounted(name, mean, slam.covariance(name), block[2], parameter_names(mount.sensor)[: len(mean) - len(mount.at)])
+        CalibratedMount(
+            name, mean, slam.covariance(name), block[2], parameter_names(mount.sensor)[: len(mean) - len(mount.at)]
+        )
         for name, mount in named.items()
         if (block := mount.block(name)) is not None and _in_map(slam, name) and len(mean := slam.mean(name))
     )

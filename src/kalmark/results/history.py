@@ -55,7 +55,7 @@ class UsedFix(NamedTuple):
     moved_m: float = 0.0
 
 
-class Placed(NamedTuple):
+class RelocatedRobot(NamedTuple):
     """A robot that readings of a sensor placed elsewhere, as the last ones agreed on it: how far, m.
 
     `before` are the readings of that sensor that the filter used until then.
@@ -68,7 +68,7 @@ class Placed(NamedTuple):
     before: int
 
 
-class Change(NamedTuple):
+class LandmarkChange(NamedTuple):
     """What became of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now."""
 
     step: int
@@ -78,7 +78,7 @@ class Change(NamedTuple):
     reason: str
 
 
-class Start(NamedTuple):
+class RobotStart(NamedTuple):
     """A robot before the first event: its name, mean and covariance, and the time of its first event."""
 
     robot: str
@@ -136,7 +136,7 @@ class Measuring(NamedTuple):
     columns: Names
 
 
-class Mounted(NamedTuple):
+class CalibratedMount(NamedTuple):
     """A sensor that calibrates itself: its name in the map, and its mount (3,) or (7,) at the end.
 
     `covariance` at the end and `prior`, that before the first event, (3, 3) or (6, 6), are in the robot's frame.  The
@@ -178,14 +178,14 @@ class Repeated(NamedTuple):
 ROWS: dict[
     str, tuple[str, Any, bool]
 ] = {  # fields of a history: their prefix in the file, and whether texts are joined
-    "changes": ("change", Change, False),
+    "changes": ("change", LandmarkChange, False),
     "fixes": ("used_fix", UsedFix, False),
-    "placed": ("placed", Placed, False),
-    "starts": ("start", Start, False),
+    "placed": ("placed", RelocatedRobot, False),
+    "starts": ("start", RobotStart, False),
     "priors": ("prior", Prior, False),
     "cameras": ("camera", Camera, True),
     "sensors": ("measuring", Measuring, True),
-    "mounts": ("mount", Mounted, True),
+    "mounts": ("mount", CalibratedMount, True),
     "biases": ("bias", Biased, True),
     "gaps": ("gap", Gap, False),
     "repeats": ("repeat", Repeated, False),
@@ -262,15 +262,15 @@ class History:
     unmeasured_Z: Array
     maps: tuple[MapSnapshot, ...] = ()
     controls: dict[str, Controlled] = field(default_factory=dict)
-    changes: tuple[Change, ...] = ()
+    changes: tuple[LandmarkChange, ...] = ()
     fixes: tuple[UsedFix, ...] = ()
-    starts: tuple[Start, ...] = ()
+    starts: tuple[RobotStart, ...] = ()
     priors: tuple[Prior, ...] = ()
     cameras: tuple[Camera, ...] = ()
     sensors: tuple[Measuring, ...] = ()
-    mounts: tuple[Mounted, ...] = ()
+    mounts: tuple[CalibratedMount, ...] = ()
     biases: tuple[Biased, ...] = ()
-    placed: tuple[Placed, ...] = ()
+    placed: tuple[RelocatedRobot, ...] = ()
     gaps: tuple[Gap, ...] = ()
     repeats: tuple[Repeated, ...] = ()
     stepped: str = "scan"

@@ -21,13 +21,13 @@ from kalmark.report import Report
 from kalmark.results.control_gaps import joined
 from kalmark.results.filter_description import biases, cameras, configuration, left_px, mounts, sensors, stated_noise
 from kalmark.results.history import (
-    Change,
     Controlled,
     History,
+    LandmarkChange,
     MapSnapshot,
-    Placed,
     Prior,
-    Start,
+    RelocatedRobot,
+    RobotStart,
     UsedFix,
     padded,
     texts,
@@ -140,7 +140,7 @@ class _Recorder:
         self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
         begins = {name: begins_at(log.events, name, robot.motion.held) for name, robot in slam.robots.items()}
         self.starts = tuple(
-            Start(name, np.array(slam.mean(name)), np.array(slam.covariance(name)), t_ns)
+            RobotStart(name, np.array(slam.mean(name)), np.array(slam.covariance(name)), t_ns)
             for name, t_ns in begins.items()
             if t_ns is not None
         )
@@ -151,7 +151,7 @@ class _Recorder:
         self.dead: list[Array] = []
         self.fixes: list[UsedFix] = []
         self.gaps: list[Gap] = []
-        self.placed: list[Placed] = []
+        self.placed: list[RelocatedRobot] = []
         self.skipped: list[str] = []
         self.stopped = ""
         self.scans: list[Scan] = []
@@ -194,7 +194,7 @@ class _Recorder:
             of = zip(self.scans, self.reports, strict=True)
             mine = [each for scan, each in of if (scan.robot, scan.sensor) == (event.robot, event.sensor)]
             before = sum(o.outcome == "associated" for each in mine for o in each.observations)
-            self.placed.append(Placed(event.t_ns, event.robot, event.sensor, report.replaced, before))
+            self.placed.append(RelocatedRobot(event.t_ns, event.robot, event.sensor, report.replaced, before))
         if type(event) not in self.stepped:
             return
         scan = report.event  # of a frame, what its detector found
@@ -319,8 +319,8 @@ def decisions(reports: list[Report], d: int) -> dict[str, Any]:
         change
         for step, report in enumerate(reports)
         for change in (
-            *(Change(step, str(gone), "merged", str(kept), why) for gone, kept, why in report.merged),
-            *(Change(step, str(gone), "removed", "", why) for gone, why in report.removed),
+            *(LandmarkChange(step, str(gone), "merged", str(kept), why) for gone, kept, why in report.merged),
+            *(LandmarkChange(step, str(gone), "removed", "", why) for gone, why in report.removed),
         )
     ]
     return {

@@ -33,7 +33,7 @@ from kalmark.results.figure_texts import (
     header,
     in_words,
 )
-from kalmark.results.history import Camera, Change, History, Ints, MapSnapshot
+from kalmark.results.history import Camera, History, Ints, LandmarkChange, MapSnapshot
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
@@ -393,7 +393,7 @@ def ambiguous(history: History) -> Ints:
     return np.sort(best[score[best] > 0])
 
 
-def _told_changes(history: History) -> list[Change]:
+def _told_changes(history: History) -> list[LandmarkChange]:
     return [c for c in history.changes if not c.reason.startswith(TENTATIVE)]
 
 

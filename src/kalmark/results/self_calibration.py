@@ -17,7 +17,7 @@ from kalmark.arrays import Array
 from kalmark.declare import unit_of
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.results.figure_texts import figure
-from kalmark.results.history import Biased, Mounted
+from kalmark.results.history import Biased, CalibratedMount
 
 AXES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m"} | dict.fromkeys(("theta", "roll", "pitch", "yaw"), "deg")
@@ -77,7 +77,7 @@ def directions(prior: Array, posterior: Array, constants: Sequence[str] = ()) ->
     return found
 
 
-def mount_figures(mount: Mounted) -> dict[str, Any]:
+def mount_figures(mount: CalibratedMount) -> dict[str, Any]:
     """Return where the filter believes a sensor to sit that calibrates itself, how far that is known, what was seen."""
     d, pose, dof = (3, 7, 6) if len(mount.mean) - len(mount.constants) == 7 else (2, 3, 3)
     sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))

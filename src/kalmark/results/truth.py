@@ -13,7 +13,7 @@ from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.logs.log import Log, PositionTrack
-from kalmark.results.history import Arrays, History, Named, Start, as_id, padded_all, texts
+from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, padded_all, texts
 from kalmark.results.landmark_table import TAG
 from kalmark.results.measures import Rigid, pose_error
 
@@ -139,20 +139,20 @@ def moved(rigid: Rigid, landmarks: Mapping[Id, Array]) -> dict[Id, Array]:
     return out
 
 
-def _known(history: History, poses: Array) -> list[Start]:
+def _known(history: History, poses: Array) -> list[RobotStart]:
     """Return the starts of robots; of those whose truth (S, 3 or 7) begins later, also their first step that has it."""
-    there, first = np.isfinite(poses).all(axis=1), list[Start]()
+    there, first = np.isfinite(poses).all(axis=1), list[RobotStart]()
     for start in history.starts:
         steps = np.flatnonzero(there & (history.robot == start.robot))
         first.append(start)
         if len(steps):
             k = int(steps[0])
             at, P = history.poses[k], history.pose_covariances[k]
-            first.append(Start(start.robot, at, P, int(history.t_ns[k])))
+            first.append(RobotStart(start.robot, at, P, int(history.t_ns[k])))
     return first
 
 
-def _offset(trajectories: Mapping[str, Any], starts: Sequence[Start], size: int) -> Array:
+def _offset(trajectories: Mapping[str, Any], starts: Sequence[RobotStart], size: int) -> Array:
     """Return the pose of the truth's frame in the map's: the origin if the first robot with truth started there."""
     for start in starts:
         if start.robot not in trajectories:

@@ -32,7 +32,7 @@ from kalmark.results.association_errors import LEAST, no_ids
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
 from kalmark.results.control_gaps import gap_warnings
 from kalmark.results.figure_texts import count, figure
-from kalmark.results.history import History, Ints, Placed, UsedFix
+from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix
 from kalmark.results.measures import cut_off, nis
 from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_warnings
@@ -289,15 +289,15 @@ def _diverged(_: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"DIVERGED: the error of {names} exceeds 10 of its own sigmas and 5 % of the path; do not use this map"
 
 
-def placements(history: History) -> list[list[Placed]]:
+def placements(history: History) -> list[list[RelocatedRobot]]:
     """Return the times when robots were placed elsewhere, those of a sensor together."""
-    of = {(one.robot, one.sensor): list[Placed]() for one in history.placed}
+    of = {(one.robot, one.sensor): list[RelocatedRobot]() for one in history.placed}
     for one in history.placed:
         of[one.robot, one.sensor].append(one)
     return [*of.values()]
 
 
-def words_of(placed: list[Placed]) -> str:
+def words_of(placed: list[RelocatedRobot]) -> str:
     """Return what readings of one sensor did."""
     far = ", ".join(figure(one.moved_m, 2) for one in placed[:LISTED]) + " m" + " and so on" * (len(placed) > LISTED)
     return f"readings of {placed[0].sensor} that agree moved {placed[0].robot} by {far}"

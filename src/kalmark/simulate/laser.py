@@ -10,10 +10,10 @@ from numpy.random import Generator
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.detect.laser_scan import Laser
-from kalmark.simulate.sights import SEGMENTS, Sensing, Things
+from kalmark.simulate.sights import SEGMENTS, SimulatedSensing, Things
 
 
-def beams(laser: Laser, sensing: Sensing, T: Array, things: dict[str, Things], rng: Generator) -> Array:
+def beams(laser: Laser, sensing: SimulatedSensing, T: Array, things: dict[str, Things], rng: Generator) -> Array:
     """Return ranges and bearings (B, 2) of a raw scan from the pose T (3,), noise included; without a return, no beam.
 
     Its beams, its noise and its ranges are those that its detector takes it to have.

@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field, model_validator
 from kalmark.arrays import Array
 from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, expected
 from kalmark.geometry.frames3d import from_euler_pose, from_frame
-from kalmark.simulate.rendering import Plane, texture
+from kalmark.simulate.rendering import Rectangle, texture
 
 TOUCH_M = 1e-3  # walls this near to each other meet
 PANEL_M = 0.4, 1.0  # width and height of a panel
@@ -56,7 +56,7 @@ class Scenery:
     segments: Array = field(default_factory=lambda: np.empty((0, 6)))
     tags: Array = field(default_factory=lambda: np.empty((0, 7)))
     tag_sizes: Array = field(default_factory=lambda: np.empty(0))
-    planes: tuple[Plane, ...] = ()
+    planes: tuple[Rectangle, ...] = ()
 
     @property
     def of_space(self) -> bool:
@@ -77,7 +77,7 @@ class OfPoints(Section):
         return Scenery(self.place(rng))
 
 
-class Walls(OfPoints):
+class WallLayout(OfPoints):
     """The limits of a cloister."""
 
     x_min_m: Number = -4.0
@@ -92,7 +92,7 @@ class Walls(OfPoints):
     """Rows and columns; 7 gives 36 landmarks."""
 
     @model_validator(mode="after")
-    def _has_room(self) -> Walls:
+    def _has_room(self) -> WallLayout:
         if self.x_max_m <= self.x_min_m or self.y_max_m <= self.y_min_m:
             raise expected("x_max_m above x_min_m and y_max_m above y_min_m")
         return self
@@ -107,7 +107,7 @@ class Walls(OfPoints):
         return np.vstack([north, east, -north, -east]) * (high - low) / (n - 1) + (low + high) / 2
 
 
-class Cloister(Walls):
+class Cloister(WallLayout):
     """Sola's cloister: a square walk, an outer wall and an inner row of columns.  [S] cloister.m."""
 
     type: Literal["cloister"] = "cloister"
@@ -167,7 +167,7 @@ class RandomField(OfPoints):
         return rng.uniform(0.0, self.size_m, (self.count, 2))
 
 
-class ThickCloister(Walls):
+class ThickCloister(WallLayout):
     """A cloister of two storeys, at z = 0 and above.  [TB] `thickCloister`."""
 
     type: Literal["thick_cloister"] = "thick_cloister"
@@ -388,7 +388,7 @@ class _Textured(Section):
             corner = np.array([-0.5 * columns * self.pixel_m, -0.5 * rows * self.pixel_m, 0.0])
             pose = middle.copy()
             pose[:3] = from_frame(middle, corner)[0]
-            out.append(Plane(pose, drawn, self.pixel_m))
+            out.append(Rectangle(pose, drawn, self.pixel_m))
         return Scenery(planes=tuple(out))
 
 

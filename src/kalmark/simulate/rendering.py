@@ -31,7 +31,7 @@ OVER = 2  # pixels in which a pixel of a texture is drawn, along each side, so t
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class Rectangle:
     """A rectangle with a texture (rows, columns): x along the columns, y along the rows, the first corner at `pose`.
 
     `pose` (7,) is that of its frame in the world; a pixel of the texture is `pixel_m` wide.  Both sides are visible.
@@ -60,7 +60,7 @@ class Renderer:
     The rays and the halved textures are made once.
     """
 
-    def __init__(self, planes: Sequence[Plane], camera: Any) -> None:
+    def __init__(self, planes: Sequence[Rectangle], camera: Any) -> None:
         self.planes = planes
         width, height = camera.image
         self.shape = int(height), int(width)

@@ -50,9 +50,9 @@ from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
 from kalmark.simulate.layouts import Scenery
-from kalmark.simulate.rendering import Plane, Renderer, rendered, rendered_depth
+from kalmark.simulate.rendering import Rectangle, Renderer, rendered, rendered_depth
 from kalmark.simulate.routes import Driver
-from kalmark.simulate.sights import POINTS, Sensing, Sighted, Things, gaussian, in_frame
+from kalmark.simulate.sights import POINTS, Sighted, SimulatedSensing, Things, gaussian, in_frame
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
 
@@ -70,7 +70,7 @@ class SimSensor:
 
     sensor: Any
     at: Array
-    sensing: Sensing
+    sensing: SimulatedSensing
     laser: Laser | None = None
     renderer: Renderer | None = None
     walked: int = 0  # the step up to which its constants have walked
@@ -201,7 +201,7 @@ def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
     return {i: row.copy() for s, t in things.items() for i, row in enumerate(rows[s], t.first)}
 
 
-def sim_robot(world: World, name: str, area: Array, chance: Chance, planes: Sequence[Plane] = ()) -> SimRobot:
+def sim_robot(world: World, name: str, area: Array, chance: Chance, planes: Sequence[Rectangle] = ()) -> SimRobot:
     """Put a robot at its start and its sensors on their mounts, drawn around configured values with sigmas.
 
     `area` (2, D) has the lower and the upper corner of the world, `planes` are those of which images are rendered.
@@ -211,7 +211,7 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance, planes: Sequ
     state = drawn_start(robot, chance.route)
     sensors = {}
     for key, mount in robot.sensors.items():
-        sensing = simulated.sensing.get(key, Sensing()).of(simulated.sensors[key], world.dt_s)
+        sensing = simulated.sensing.get(key, SimulatedSensing()).of(simulated.sensors[key], world.dt_s)
         raw = mount.detector if isinstance(mount.detector, Laser) else None
         true, at = drawn_mount(mount, chance.mounts)
         sensors[key] = SimSensor(true, at, sensing, raw, Renderer(planes, true) if sensing.images else None)

@@ -56,7 +56,7 @@ class Sighted(NamedTuple):
     ids: list[Id]
 
 
-class Sensing(Section):
+class SimulatedSensing(Section):
     """How a simulated sensor departs from its model: a slower rate, and faults."""
 
     every: Annotated[int, Field(ge=1)] | None = None
@@ -88,7 +88,7 @@ class Sensing(Section):
     faults_from_step: Annotated[int, Field(ge=1)] = 1
     """All is well before this step."""
 
-    def of(self, section: Any, dt_s: float) -> Sensing:
+    def of(self, section: Any, dt_s: float) -> SimulatedSensing:
         """Return it with what it leaves open taken from the `preset` of the sensor's section, if that has one."""
         preset = presets.ALL.get(section.model_dump().get("preset") or "")
         if preset is None:
@@ -245,7 +245,7 @@ def chosen(
 
 
 def faulty(
-    sensor: Any, sighted: Sighted, sensing: Sensing, k: int, things: Things, rng: Generator
+    sensor: Any, sighted: Sighted, sensing: SimulatedSensing, k: int, things: Things, rng: Generator
 ) -> tuple[Sighted, list[Id | None]]:
     """Return what is reported at step k of what is seen, before noise, and what each observation is really of."""
     real: list[Id | None] = list(sighted.ids)

@@ -29,7 +29,7 @@ from kalmark.config.sections import Positive, Section, expected, model_of
 from kalmark.config.tree import Tree, merged, read_tree
 from kalmark.simulate.layouts import Layout, TexturedPlanes, TexturedRoom
 from kalmark.simulate.routes import Constant, Route, Waypoints
-from kalmark.simulate.sights import Sensing
+from kalmark.simulate.sights import SimulatedSensing
 
 Count = Annotated[int, Field(ge=1)]
 IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types of sensors whose images can be rendered
@@ -38,7 +38,7 @@ IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types o
 class _Underway(Section):
     route: Route
     """Where it is told to go."""
-    sensing: dict[str, Sensing] = Field(default_factory=dict)
+    sensing: dict[str, SimulatedSensing] = Field(default_factory=dict)
     """By a sensor's name: its rate, and what is wrong with it."""
 
     @model_validator(mode="after")

@@ -18,7 +18,7 @@ from scipy.linalg import solve
 from kalmark.arrays import Array
 from kalmark.filter.estimators import Estimator, Update
 from kalmark.filter.map import Map, StochasticMap
-from kalmark.slam.held_control import Moving, Part
+from kalmark.slam.held_control import MotionPart, Moving
 from kalmark.slam.replacing import NEEDED
 
 LASTS_S = 30.0  # readings fit an alternative that is right; the errors of receivers among houses seldom last so long
@@ -66,7 +66,7 @@ class Alternative:
             factor[i] = min(factor[i], max(WIDEST_RAD / max(np.sqrt(P[i, i]), 1e-12), 1.0))
         self.map.predict(rows, np.diag(factor), np.zeros_like(P))
 
-    def move(self, estimator: Estimator, part: Part) -> bool:
+    def move(self, estimator: Estimator, part: MotionPart) -> bool:
         """Move the robot by a part of its control; return whether that leads anywhere."""
         return estimator.predict(self.map, self.moving.movement(self.map, part))
 

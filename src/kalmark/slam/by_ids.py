@@ -12,7 +12,7 @@ import numpy as np
 
 from kalmark.events import Id, Scan
 from kalmark.filter.estimators import Update
-from kalmark.report import Judged, Report
+from kalmark.report import JudgedScan, Report
 from kalmark.slam import moves, tentative
 from kalmark.slam.checks import measurements
 from kalmark.slam.held_readings import again
@@ -51,9 +51,9 @@ def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Re
         scan = ScanContext(
             state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report
         )  # fmt: skip
-        group = Judged(range(len(ids)), ids, ids, done, channel.gate)
+        group = JudgedScan(range(len(ids)), ids, ids, done, channel.gate)
         tentative.contest(state, scan, model, group, ~fused & ~np.isnan(done.d2), policy.upkeep.odds)
     if report.gaps and fused.any():
         moving.held.located(event.t_ns)
-    report.judged = (Judged(range(len(ids)), ids, ids, done, channel.gate),)
+    report.judged = (JudgedScan(range(len(ids)), ids, ids, done, channel.gate),)
     return report

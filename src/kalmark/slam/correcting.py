@@ -16,7 +16,7 @@ from kalmark.filter.estimators import Averaging, Correction, Update
 from kalmark.geometry.gaussian import gate
 from kalmark.management import ambiguous_tags, measured_depths
 from kalmark.management.attention import chosen
-from kalmark.report import INDEFINITE, Judged, Observation
+from kalmark.report import INDEFINITE, JudgedScan, Observation
 from kalmark.slam import surveyed_corrections, tentative
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
@@ -27,11 +27,11 @@ from kalmark.tracks.surveys import SURVEYED
 
 def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],
     decisions: Sequence[Decision],
-) -> tuple[list[Judged], list[Observation]]:  # fmt: skip
+) -> tuple[list[JudgedScan], list[Observation]]:  # fmt: skip
     """Fuse observations of landmarks in the map, the groups of those of one type at once.  [S] (26)-(30)."""
     report, most = scan.report, policy.attention.updates
     found: list[Observation] = []
-    judged: list[Judged] = []
+    judged: list[JudgedScan] = []
     if most is not None and sum(len(rows) for _, rows in groups) > most:
         groups, out = chosen(scan, policy.attention, groups, decisions)
         why = f"not among the {most} of most information"
@@ -56,7 +56,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
             else state.corrected(update, scan.event)
         )
         report.fill(rows, done)
-        judged.append(Judged(rows, scan.ids, names, done, min(scan.channel.gate, least)))
+        judged.append(JudgedScan(rows, scan.ids, names, done, min(scan.channel.gate, least)))
         if policy.contests:
             misfits = _misfits(scan, model, slots, rows, update, done)
             tentative.contest(state, scan, model, judged[-1], misfits, policy.upkeep.odds)
@@ -65,7 +65,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
 
 
 def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions: Sequence[Decision]
-) -> list[Judged]:  # fmt: skip
+) -> list[JudgedScan]:  # fmt: skip
     """Correct by observations of landmarks known exactly, as by fixes.  docs/localization.md."""
     report, known, m = scan.report, state.tracks.known, scan.y.shape[1]
     groups = state.tracks.known_by_model(scan.channel, [name for name, _ in decisions])
@@ -86,7 +86,7 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
         done = done._replace(e=done.e[:, :m])
         report.fill(rows, done)
         known.count(names, done.fused.tolist())
-        judged.append(Judged(rows, scan.ids, names, done, min(scan.channel.gate, least)))
+        judged.append(JudgedScan(rows, scan.ids, names, done, min(scan.channel.gate, least)))
     return judged
 
 

@@ -149,7 +149,7 @@ class Estimate:
     def place(self, name: Id) -> tuple[Array, Array]:
         """Return where a robot or a landmark is: mean (2 or 3,) and covariance, m and m^2, in the map's frame.
 
-        A landmark's model says where it is (`Placed`); of a line it is its point nearest to the anchor or the origin.
+        A landmark's model says where it is (`HasPlace`); of a line it is its point nearest to the anchor or the origin.
         Raises MapError for a landmark whose model does not say where it is.
         """
         mean, P, model = self.mean(name), self.covariance(name), self.landmark_model(name)

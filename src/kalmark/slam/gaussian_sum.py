@@ -29,7 +29,7 @@ from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import Space
 from kalmark.models.observe import linearize
 from kalmark.slam.alternative import Alternative
-from kalmark.slam.held_control import Moving, Part
+from kalmark.slam.held_control import MotionPart, Moving
 from kalmark.tracks.linearity import SIGMAS, bends, turn_holds, turned
 from kalmark.tracks.surveys import SURVEYED
 
@@ -44,7 +44,7 @@ ANYWHERE_M = 1e4  # sigma of a position that may be any
 IN_A_ROW = 5  # observations that do not fit the filter of a robot, or over which a sum is linear, decide
 
 
-class Seen(NamedTuple):
+class KnownObservation(NamedTuple):
     """An observation of a landmark known exactly at l (2,): `update` has one row; `gate` is that of its d2.
 
     The sensor is at `at` (3,), unless its mount is in the map.  `is_distance`: it is a distance, or stands for one.
@@ -67,7 +67,7 @@ class Seen(NamedTuple):
         return -0.25 * self.gate - 0.5 * float(np.linalg.slogdet(self.update.R[0])[1])
 
 
-def log_likelihood(done: Correction, k: int, seen: Seen) -> float:
+def log_likelihood(done: Correction, k: int, seen: KnownObservation) -> float:
     """Return that of the k-th observation of a correction, at least that of an outlier."""
     if not math.isfinite(done.d2[k]):
         return seen.floor
@@ -118,19 +118,21 @@ class GaussianSum:
         yield self.prior
         yield from self.parts
 
-    def move(self, estimator: Estimator, part: Part) -> bool:
+    def move(self, estimator: Estimator, part: MotionPart) -> bool:
         """Move the robot by a part of its control; return whether that leads anywhere."""
         return all([each.move(estimator, part) for each in self.all()])
 
     def correct(self, estimator: Estimator, update: Update) -> None:
         """Correct by a reading of the robot's own state."""
-        seen = Seen(update, np.zeros(2), np.zeros(3), chi2_gate(SURVEYED, update.R.shape[1]), is_distance=False)
+        seen = KnownObservation(
+            update, np.zeros(2), np.zeros(3), chi2_gate(SURVEYED, update.R.shape[1]), is_distance=False
+        )
         estimator.correct(self.prior.map, update)
         for i, each in enumerate(self.parts):
             self.log_weights[i] += log_likelihood(estimator.correct(each.map, update), 0, seen)
         self._prune()
 
-    def observe(self, estimator: Estimator, seen: Seen) -> tuple[Correction | None, float]:
+    def observe(self, estimator: Estimator, seen: KnownObservation) -> tuple[Correction | None, float]:
         """Correct by an observation of a known landmark; return what the likeliest part expected and the evidence.
 
         None where all parts begin by it.  The evidence is its log-likelihood under the whole sum.
@@ -156,7 +158,7 @@ class GaussianSum:
         self._prune()
         return expected, self._total() - before
 
-    def _begin(self, estimator: Estimator, seen: Seen) -> None:
+    def _begin(self, estimator: Estimator, seen: KnownObservation) -> None:
         """Begin parts from the prior, by an observation."""
         first = copied(self.prior)
         pieces = refined(first, self.prior_log, seen)
@@ -261,7 +263,7 @@ def moments(
 
 
 # ---------------------------------------------------------------------- splitting
-def refined(each: Alternative, w: float, seen: Seen) -> list[tuple[Alternative, float, bool]]:
+def refined(each: Alternative, w: float, seen: KnownObservation) -> list[tuple[Alternative, float, bool]]:
     """Return a part with its log weight split until an observation is as good as linear over each piece.
 
     Pieces of a ring have taken the observation: the third of each is then true.
@@ -283,7 +285,7 @@ def refined(each: Alternative, w: float, seen: Seen) -> list[tuple[Alternative, 
     return out
 
 
-def bent_axes(map_: Map, robot: int, seen: Seen) -> Flags:
+def bent_axes(map_: Map, robot: int, seen: KnownObservation) -> Flags:
     """Return along which axes (3,) of a robot's pose no linearisation describes an observation."""
     update = seen.update
     pose = map_.mean(robot)[:3]
@@ -311,7 +313,7 @@ def headings(each: Alternative, w: float) -> list[tuple[Alternative, float]]:
     return out
 
 
-def ring(each: Alternative, seen: Seen) -> list[tuple[Alternative, float]]:
+def ring(each: Alternative, seen: KnownObservation) -> list[tuple[Alternative, float]]:
     """Return a part, corrected by a distance, as pieces of the ring about a landmark, with their log likelihoods."""
     slots, robot, mount = range(len(each.map.spaces)), each.moving.slot, seen.update.mount
     r, own = each.map.mean(robot), np.zeros(0) if mount < 0 else each.map.mean(mount)
@@ -338,7 +340,7 @@ def ring(each: Alternative, seen: Seen) -> list[tuple[Alternative, float]]:
     return out
 
 
-def distance(seen: Seen, own: Array) -> tuple[float, float] | None:
+def distance(seen: KnownObservation, own: Array) -> tuple[float, float] | None:
     """Return the distance that a measurement stands for and its sigma, None where none does.
 
     `own` is the mount with the constants of the sensor, as they are in the map.

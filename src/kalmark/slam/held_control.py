@@ -37,13 +37,13 @@ from kalmark.models.protocols import (
 )
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
-from kalmark.slam.replacing import LeftOut
+from kalmark.slam.replacing import RejectedFix
 
 NO_NOISE = np.zeros((0, 0))
 MOST, CHANGED = 30, 4.0  # controls in their mean, and sigmas by which noise alone moves hardly any
 
 
-class Part(NamedTuple):
+class MotionPart(NamedTuple):
     """One piece of motion: the control, the covariance N of its error, and its duration.
 
     `first` and `last` say whether it begins and ends its control's interval: if not both, the error is shared.
@@ -60,7 +60,7 @@ class Part(NamedTuple):
     usual: Array | None = None
 
 
-class Mean(NamedTuple):
+class RateMean(NamedTuple):
     """The mean (k,) of the last controls or readings, as rates: of a `number` that differ by their noise alone.
 
     What a constant does is proportional to a control, or to a reading as it is expected after one.  Of the measured
@@ -72,12 +72,12 @@ class Mean(NamedTuple):
     rate: Array
     number: int
 
-    def after(self, rate: Array, sigma: Array) -> Mean:
+    def after(self, rate: Array, sigma: Array) -> RateMean:
         """Return the mean with one more, of a noise sigma (k,); it begins anew where the control has changed."""
         if (np.abs(rate - self.rate) > CHANGED * sigma * math.sqrt(1.0 + 1.0 / self.number)).any():
-            return Mean(rate, 1)
+            return RateMean(rate, 1)
         number = min(self.number + 1, MOST)
-        return Mean(self.rate + (rate - self.rate) / number, number)
+        return RateMean(self.rate + (rate - self.rate) / number, number)
 
 
 def noise_of(motion: Motion, control: Control) -> Array:
@@ -99,7 +99,7 @@ class HeldInput:
     u: Array | None
     N: Array | None
     usual: Array | None  # as earlier controls tell it,
-    mean: Mean | None  # which is their mean
+    mean: RateMean | None  # which is their mean
     fresh: bool
     gaps: Gaps | None
 
@@ -140,7 +140,7 @@ class HeldInput:
         on_time = gaps is None or (to_ns <= gaps.late_ns and gaps.noticed is None)
         return on_time and not (self.motion.held or self.coasts)
 
-    def advance(self, to_ns: int, last: bool = False) -> Part | None:
+    def advance(self, to_ns: int, last: bool = False) -> MotionPart | None:
         """Return the part from where the robot stands to `to_ns`, or None if it does not move."""
         if self.coasts:
             return self._coast(to_ns)
@@ -149,11 +149,11 @@ class HeldInput:
         if self.u is None or self.N is None or self.t_ns is None or to_ns <= self.t_ns:
             return None
         unknown = None if self.gaps is None or to_ns <= self.gaps.late_ns else self.gaps.unknown(to_ns)
-        part = Part(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last, unknown, self.usual)
+        part = MotionPart(self.u, self.N, (to_ns - self.t_ns) * 1e-9, self.fresh, last, unknown, self.usual)
         self.t_ns, self.fresh = to_ns, False
         return part
 
-    def _lost(self, to_ns: int, u: Array | None = None) -> Part | None:
+    def _lost(self, to_ns: int, u: Array | None = None) -> MotionPart | None:
         """Return what is unknown of the motion up to a time, of increments that are late; u (k,) ends then."""
         if self.gaps is None or to_ns <= self.gaps.late_ns:
             return None
@@ -161,7 +161,7 @@ class HeldInput:
         if unknown is None:
             return None
         k = len(self.motion.columns)
-        return Part(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)
+        return MotionPart(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)
 
     def noticed(self) -> tuple[Gap, ...]:
         """Return the gap that was noticed since the last question, if any."""
@@ -190,15 +190,15 @@ class HeldInput:
         moves = self.coasts or self.u is not None
         return moves and self.t_ns is not None and t_ns > self.t_ns
 
-    def _coast(self, to_ns: int) -> Part | None:
+    def _coast(self, to_ns: int) -> MotionPart | None:
         """Return the part of a robot that needs no control to move, from the first event on."""
         t_ns, self.t_ns = self.t_ns, to_ns
         if t_ns is None or to_ns <= t_ns:
             return None
         k = len(self.motion.columns)
-        return Part(np.zeros(k), np.zeros((k, k)), (to_ns - t_ns) * 1e-9, True, True)
+        return MotionPart(np.zeros(k), np.zeros((k, k)), (to_ns - t_ns) * 1e-9, True, True)
 
-    def accept(self, control: Control) -> list[Part]:
+    def accept(self, control: Control) -> list[MotionPart]:
         """Take a new control; return the parts of motion it closes."""
         if control.t_ns <= self.rests_until_ns:
             return []
@@ -208,7 +208,7 @@ class HeldInput:
         if not self.motion.held:
             dt_s = 0.0 if self.t_ns is None else (control.t_ns - self.t_ns) * 1e-9
             part = self._lost(control.t_ns, control.u)
-            closing = [Part(control.u, N, dt_s, True, True, None, self._usual(control.u, N, dt_s))]
+            closing = [MotionPart(control.u, N, dt_s, True, True, None, self._usual(control.u, N, dt_s))]
             self.t_ns = control.t_ns
         else:
             part, closing = self.advance(control.t_ns, last=True), []
@@ -223,10 +223,10 @@ class HeldInput:
         if not self.calibrates or dt_s <= 0.0:
             return None
         rate, before = u / dt_s, self.mean
-        self.mean = Mean(rate, 1) if before is None else before.after(rate, np.sqrt(np.diag(N)) / dt_s)
+        self.mean = RateMean(rate, 1) if before is None else before.after(rate, np.sqrt(np.diag(N)) / dt_s)
         return u if before is None or self.mean.number == 1 else before.rate * dt_s
 
-    def _left_out(self, control: Control, gaps: Gaps) -> list[Part]:
+    def _left_out(self, control: Control, gaps: Gaps) -> list[MotionPart]:
         """Leave out a control that is ruled out; return the motion up to then."""
         if self.motion.held:
             part = self.advance(control.t_ns, last=True)
@@ -235,7 +235,7 @@ class HeldInput:
             return [] if part is None else [part]
         k, unknown = len(self.motion.columns), gaps.leave_out(control)
         self.t_ns = control.t_ns
-        return [] if unknown is None else [Part(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)]
+        return [] if unknown is None else [MotionPart(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)]
 
 
 @dataclass
@@ -251,7 +251,7 @@ class Moving:
     bias: int | None
     held: HeldInput
     error: int | None = None
-    left_out: list[LeftOut] = field(default_factory=list)
+    left_out: list[RejectedFix] = field(default_factory=list)
     SAVED: ClassVar = ("slot", "bias", "held", "error", "left_out")
 
     @cached_property
@@ -264,7 +264,7 @@ class Moving:
         """The motion as the filter takes it."""
         return step_of(self.motion)
 
-    def added(self, map_: Map, part: Part) -> tuple[list[int], Array, Array]:
+    def added(self, map_: Map, part: MotionPart) -> tuple[list[int], Array, Array]:
         """Return the slots of the blocks that change a control, how, B (m, c) by their numbers b, and u with u + B b.
 
         That holds at the means of the constants, and B is that of the control as it usually is.
@@ -282,7 +282,7 @@ class Moving:
             slots, columns, u = [*slots, self.bias], [*columns, U_a], true - U_a @ a
         return slots, np.hstack(columns) if len(columns) > 1 else columns[0], u
 
-    def leads_somewhere(self, map_: Map, parts: Sequence[Part]) -> bool:
+    def leads_somewhere(self, map_: Map, parts: Sequence[MotionPart]) -> bool:
         """Return whether parts of its controls, one after the other, lead to finite places, with finite covariances."""
         r = map_.mean(self.slot)
         for part in parts:
@@ -294,13 +294,13 @@ class Moving:
             r = moved[0]
         return True
 
-    def _diffusion(self, map_: Map, part: Part) -> Array | None:
+    def _diffusion(self, map_: Map, part: MotionPart) -> Array | None:
         motion: Any = self.motion
         if self.moves_itself:
             return motion.diffusion_at(map_.mean(self.slot), part.u, part.dt_s)
         return motion.diffusion(part.u, part.dt_s)
 
-    def movement(self, map_: Map, part: Part) -> Movement:
+    def movement(self, map_: Map, part: MotionPart) -> Movement:
         """Return what one part of its control does to the robot in a map."""
         D = self._diffusion(map_, part)
         if part.unknown is not None:

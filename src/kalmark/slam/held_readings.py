@@ -19,7 +19,7 @@ from kalmark.arrays import Array
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate
 from kalmark.report import Observation, Report
-from kalmark.slam.held_control import Part
+from kalmark.slam.held_control import MotionPart
 
 AGAIN = "it repeats the one before to the last bit, though the robot has moved: it is no new measurement"
 SELDOM = 0.01  # of new measurements may be taken for old ones
@@ -36,7 +36,7 @@ def again(report: Report, ids: Sequence[Id | None], p: int, of: Id | None = None
 
 
 @dataclass
-class Given:
+class LastMeasurement:
     """What a sensor gave last, y (K, m) with its ids, and what its measurements have told of their numbers.
 
     Of each column: the `least` difference of successive measurements (0 of none), the sum of the logarithms of
@@ -57,12 +57,12 @@ class Given:
     since_ns: int = 0
 
     @classmethod
-    def of(cls, y: Array, ids: tuple[Id | None, ...] | None) -> Given:
+    def of(cls, y: Array, ids: tuple[Id | None, ...] | None) -> LastMeasurement:
         """Return what a first measurement tells."""
         m = y.shape[1]
         return cls(y, ids, *np.zeros((4, m)))
 
-    def moved(self, part: Part) -> None:
+    def moved(self, part: MotionPart) -> None:
         """Take a part of a control of the robot."""
         u, N = (part.u * part.dt_s, part.N * part.dt_s**2) if part.dt_s > 0.0 else (part.u, part.N)
         if len(self.went) != len(u):

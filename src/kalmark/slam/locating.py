@@ -27,8 +27,8 @@ from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.gaussian import gate
 from kalmark.models.observe import linearize
 from kalmark.models.protocols import distances_alone, place_of
-from kalmark.report import Judged, Observation
-from kalmark.slam.gaussian_sum import IN_A_ROW, GaussianSum, Seen, bent_axes, log_likelihood, written
+from kalmark.report import JudgedScan, Observation
+from kalmark.slam.gaussian_sum import IN_A_ROW, GaussianSum, KnownObservation, bent_axes, log_likelihood, written
 from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.linearity import bends, turn_holds
@@ -99,7 +99,7 @@ def _place(state: State, name: Any) -> Array:
     return known.mean(name) if name in known else state.map.mean(state.tracks.slot(name))
 
 
-def weighed(state: State, scan: ScanContext, judged: Sequence[Judged]) -> None:
+def weighed(state: State, scan: ScanContext, judged: Sequence[JudgedScan]) -> None:
     """Compare the filter of a robot with the sum of where else it may be, by what both expected of a scan."""
     sum_ = state.sums.get(scan.event.robot)
     if sum_ is None or not can_be_summed(scan.channel) or not judged:
@@ -143,12 +143,12 @@ def _gate(scan: ScanContext) -> float:
     return gate(SURVEYED, scan.channel.dof)
 
 
-def _seen(state: State, scan: ScanContext, map_: Map) -> list[tuple[int, Seen]]:
+def _seen(state: State, scan: ScanContext, map_: Map) -> list[tuple[int, KnownObservation]]:
     """Return the observations of landmarks that are known, with their numbers, as those of a robot in a map alone.
 
     The covariance of a survey is noise: what it says of the survey is left alone.
     """
-    tracks, channel, out = state.tracks, scan.channel, list[tuple[int, Seen]]()
+    tracks, channel, out = state.tracks, scan.channel, list[tuple[int, KnownObservation]]()
     for k, name in enumerate(scan.ids):
         kind = tracks.sort(name) if name in tracks.known or name in state.surveys.trial else None
         model = channel.models.get(kind or "")
@@ -163,7 +163,7 @@ def _seen(state: State, scan: ScanContext, map_: Map) -> list[tuple[int, Seen]]:
         place = place_of(model.landmark, l[None])
         is_distance = distances_alone(channel.sensor) and place is not None
         where = np.full(2, np.nan) if place is None else place[0][0, :2]
-        out.append((k, Seen(update, where, channel.at, _gate(scan), is_distance)))
+        out.append((k, KnownObservation(update, where, channel.at, _gate(scan), is_distance)))
     return out
 
 

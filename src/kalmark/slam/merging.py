@@ -29,7 +29,7 @@ def merge_seen(state: State, scan: ScanContext, policy: Policy) -> None:
     state.tracks.note_scan(names)
     if not policy.upkeep.merge:
         return
-    search = merge.Search(state.tracks, [name for name, o in zip(names, seen, strict=True) if o.id is None])
+    search = merge.MergeSearch(state.tracks, [name for name, o in zip(names, seen, strict=True) if o.id is None])
     while (name := search.next()) is not None:
         track = state.tracks.confirmed[name]
         if search.is_first_pass:

@@ -11,10 +11,10 @@ from kalmark.errors import EventError, MapError
 from kalmark.events import seconds
 from kalmark.geometry.spaces import Rn
 from kalmark.report import Gap
-from kalmark.slam.held_control import Part
+from kalmark.slam.held_control import MotionPart
 from kalmark.slam.state import State
 
-Moves = tuple[tuple[str, Part], ...]  # parts of their controls, by the names of robots
+Moves = tuple[tuple[str, MotionPart], ...]  # parts of their controls, by the names of robots
 
 
 def advance(state: State, name: str, *others: str, before: Moves = ()) -> tuple[Gap, ...]:
@@ -38,18 +38,18 @@ def advance(state: State, name: str, *others: str, before: Moves = ()) -> tuple[
         return held.noticed()
 
 
-def refuse_nowhere(state: State, name: str, parts: Sequence[Part]) -> None:
+def refuse_nowhere(state: State, name: str, parts: Sequence[MotionPart]) -> None:
     """Refuse, before anything has moved, parts of a robot's controls that lead nowhere."""
     if not state.moving[name].leads_somewhere(state.map, parts):
         raise _nowhere(state, name, parts[-1])
 
 
-def _nowhere(state: State, name: str, part: Part) -> EventError:
+def _nowhere(state: State, name: str, part: MotionPart) -> EventError:
     what = f"{name!r} at t={seconds(state.t_ns or 0)} s"
     return EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
 
 
-def move(state: State, name: str, part: Part) -> None:
+def move(state: State, name: str, part: MotionPart) -> None:
     """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
     moving = state.moving[name]
     if not isinstance(moving.model, tuple):  # a user's: nothing is known of it

@@ -19,7 +19,7 @@ from kalmark.models import protocols
 from kalmark.models.protocols import CHANGE, POSE, HoldsRate, Motion, OfState
 from kalmark.models.state_view import sees_state, state_view_of
 from kalmark.slam.checks import measurements
-from kalmark.slam.held_control import Mean, Moving
+from kalmark.slam.held_control import Moving, RateMean
 from kalmark.slam.rests import Standing
 
 POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures where an antenna is
@@ -35,7 +35,7 @@ def _time(event: Scan, k: int) -> int:
         raise EventError(f"{when(event)}: id {name!r}, expected the time in s of an earlier scan") from None
 
 
-class Reader:
+class StateReader:
     """A sensor of the state of a robot that moves by `motion`; `mount` is the slot of its mount, -1 for none.
 
     `counts`: what it measures counts from its last scan, where a clone of the robot's pose was left, or, by an id that
@@ -46,7 +46,7 @@ class Reader:
 
     t_ns: int | None  # of its last reading
     standing: Standing | None
-    mean: Mean | None  # of its readings, where its scale is estimated of what the robot's controls say,
+    mean: RateMean | None  # of its readings, where its scale is estimated of what the robot's controls say,
     sigma: Array  # and what the last was uncertain by, as a rate
     until: dict[int, int] | None  # of a scan that readings of a log count from, the time of the last
 
@@ -167,7 +167,7 @@ class Reader:
         if self.scales:
             unit_s = since_s if self.sensor.views == CHANGE else 1.0
             rate, self.sigma = y[0] / unit_s, np.sqrt(np.diag(Z[0])) / unit_s
-            self.mean = Mean(rate, 1) if self.mean is None else self.mean.after(rate, self.sigma)
+            self.mean = RateMean(rate, 1) if self.mean is None else self.mean.after(rate, self.sigma)
 
     def estimator(self, estimator: Estimator, is_loop: bool) -> Estimator:
         """Return how a reading is fused: absolute poses and loops with iterations, how the robot moved without.

@@ -33,7 +33,7 @@ SHARE = 0.999  # of agreeing fixes that are believed
 LOOSE = 2.0  # sigmas of a fix, for what the robot's motion adds between the fixes
 
 
-class LeftOut(NamedTuple):
+class RejectedFix(NamedTuple):
     """A fix y (d,) with covariance R (d, d) that was left out when the filter believed what it is of at p (d,)."""
 
     y: Array
@@ -61,7 +61,7 @@ class Replaced(NamedTuple):
     shift: Shift
 
 
-def replaced(pose: Array, P: Array, left_out: Sequence[LeftOut]) -> Replaced | None:
+def replaced(pose: Array, P: Array, left_out: Sequence[RejectedFix]) -> Replaced | None:
     """Return where a robot is that is believed at `pose`, with the covariance P; None where fixes do not tell."""
     if len(left_out) < NEEDED:
         return None

@@ -43,7 +43,7 @@ TINY = 1e-300  # a variance that is none
 Constants = Callable[..., tuple[Array, Array] | None]  # of robot and sensor: its constants in the map, covariance
 
 
-class Mean(NamedTuple):
+class WindowMean(NamedTuple):
     """Of a column in a window: mean, its sigma, squared deviations in sigmas, and how many of them are independent."""
 
     column: str
@@ -83,7 +83,7 @@ class Source:
         scale = 1.0 / dt_s if self.per_s else 1.0
         self.readings.append((y[self.at] * scale, np.diagonal(R)[self.at] * scale**2))
 
-    def means(self, constants: Constants) -> list[Mean]:
+    def means(self, constants: Constants) -> list[WindowMean]:
         """Return what the readings of this window say, less what a robot that stands is expected to read."""
         z, s2 = (np.array(column) for column in zip(*self.readings, strict=True))
         bias, variance = self._expected(constants)
@@ -91,7 +91,7 @@ class Source:
         mean, sigma2 = (w * z).sum(axis=0) / w.sum(axis=0), 1.0 / w.sum(axis=0)
         deviations, free = (w * (z - mean) ** 2).sum(axis=0), len(z) - 1
         rows = zip(self.columns, mean - bias, np.sqrt(sigma2 + variance), deviations, strict=True)
-        return [Mean(column, float(m), float(s), float(d), free) for column, m, s, d in rows]
+        return [WindowMean(column, float(m), float(s), float(d), free) for column, m, s, d in rows]
 
     def _expected(self, constants: Constants) -> tuple[Array, Array]:
         """Return what a robot that stands is expected to read (c,), by the sensor's constants, and the variances (c,).
@@ -183,7 +183,7 @@ class Standing:
             self._refutes(m, self.sensor.slowest_radps) for m in best
         )
 
-    def _refutes(self, m: Mean, slowest: float) -> bool:
+    def _refutes(self, m: WindowMean, slowest: float) -> bool:
         """Return whether a mean refutes the slowest motion that counts."""
         return abs(m.mean) <= slowest - self._sure * m.sigma
 

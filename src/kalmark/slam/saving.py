@@ -33,7 +33,7 @@ from kalmark.slam.alternative import Alternative, alone
 from kalmark.slam.description import Description, describe, model
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.held_control import bias_block, bias_name
-from kalmark.slam.reader import Reader as StateReader
+from kalmark.slam.reader import StateReader
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel

@@ -42,7 +42,7 @@ from kalmark.events import (
     seconds,
     when,
 )
-from kalmark.filter.estimators import Compiling, Estimator, Invariant
+from kalmark.filter.estimators import CompilingEstimator, Estimator, Invariant
 from kalmark.geometry.spaces import RHO
 from kalmark.management import reparametrize as points
 from kalmark.management.attention import left_out
@@ -106,7 +106,7 @@ class Slam(Estimate):
         self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may ask `expect`
         self._ahead: list[int] = []  # times of the events in a row that came too far ahead
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Frame: self._frame, Fix: self._fix}
-        if isinstance(estimator, Compiling):
+        if isinstance(estimator, CompilingEstimator):
             kinds = [kind for channel in self.state.channels.values() for kind in channel.landmark.space.kinds]
             axes = max(robot.motion.space.axes for robot in by_name.values())
             estimator.compile_ahead(axes, RHO in kinds)

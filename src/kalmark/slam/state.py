@@ -21,9 +21,9 @@ from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
-from kalmark.slam.held_readings import SELDOM, Given
+from kalmark.slam.held_readings import SELDOM, LastMeasurement
 from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, policy_of, refuse_other_world
-from kalmark.slam.reader import LEAST_S, Reader
+from kalmark.slam.reader import LEAST_S, StateReader
 from kalmark.slam.rests import standing_of
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.tracks.channel import Channel, Parts
@@ -67,13 +67,13 @@ class State:
     tracks: Tracks
     clones: Clones
     surveys: Surveys
-    given: dict[ChannelKey, Given]
+    given: dict[ChannelKey, LastMeasurement]
     placed: int  # fixes that have told where the map is in the world; a survey counts as many
     moving: dict[str, Moving]
     alternatives: dict[str, Alternative]
     sums: dict[str, GaussianSum]
     front_ends: dict[ChannelKey, FrontEnd]
-    readers: dict[ChannelKey, Reader]
+    readers: dict[ChannelKey, StateReader]
 
     def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
         self.settings, self.robots, self.t_ns, self.taken, self.placed = settings, robots, None, set(), 0
@@ -128,7 +128,7 @@ class State:
                 standing = standing_of(mount.sensor, robot)
                 if standing is not None:
                     self.standing[robot.name] = name
-                self.readers[robot.name, name] = Reader(mount.sensor, robot.motion, mount.at, mount_slot, standing)
+                self.readers[robot.name, name] = StateReader(mount.sensor, robot.motion, mount.at, mount_slot, standing)
                 continue
             association = mount.association or settings.association
             landmark = landmark_of(mount, settings.landmarks)
@@ -202,7 +202,7 @@ class State:
         """Take note of what a sensor measured, y (K, m); return whether it is what it gave before (`held_readings`)."""
         given = self.given.get(key)
         if given is None or given.y.shape[1] != y.shape[1]:
-            self.given[key] = Given.of(y, ids)
+            self.given[key] = LastMeasurement.of(y, ids)
             return False
         if not given.take(y, ids) or given.chance >= SELDOM:
             return False

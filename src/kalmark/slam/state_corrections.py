@@ -12,19 +12,19 @@ from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Correction, Update
 from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.observe import fix_view
-from kalmark.report import Judged, Observation, Report, outcomes_of
+from kalmark.report import JudgedScan, Observation, Report, outcomes_of
 from kalmark.slam import moves, replacing
 from kalmark.slam.alternative import Alternative, put
 from kalmark.slam.checks import refuse_bad_fix
 from kalmark.slam.held_readings import again
-from kalmark.slam.reader import Reader
+from kalmark.slam.reader import StateReader
 from kalmark.slam.state import State
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes stay within
 
 
-def read(state: State, event: Scan, reader: Reader) -> Report:
+def read(state: State, event: Scan, reader: StateReader) -> Report:
     """Correct by what a sensor measures of its own robot; leave a clone where its next readings count from here."""
     key, R, report = (event.robot, event.sensor), reader.noise(event), Report(event, event.y)
     begins = reader.begins_ns(event)
@@ -56,7 +56,7 @@ def read(state: State, event: Scan, reader: Reader) -> Report:
         done = state.corrected(update, event, estimator)
         done = done._replace(e=done.e[:, : event.width])
         report.fill([k], done)
-        found += outcomes_of(Judged([k], [None] * len(event.y), [event.robot], done, reader.gate))
+        found += outcomes_of(JudgedScan([k], [None] * len(event.y), [event.robot], done, reader.gate))
         if done.fused[0] and not is_loop:
             reader.take(event.y[k : k + 1], done.Z, since_s)
         if reader.is_position:
@@ -106,7 +106,7 @@ def fix(state: State, event: Fix) -> Report:
         state.sums[event.robot].correct(estimator, update)
     done = state.corrected(update, event, estimator)
     report.e, report.z, report.Z = done.e, done.z, done.Z
-    report.judged = (Judged([0], [event.robot], [event.robot], done, gate),)
+    report.judged = (JudgedScan([0], [event.robot], [event.robot], done, gate),)
     report.replaced = _believed(state, event.robot, event.y, event.cov, done, fits)
     return report
 
@@ -125,7 +125,7 @@ def _believed(state: State, name: str, y: Array, R: Array, done: Correction, fit
         return 0.0
     assert state.t_ns is not None
     del moving.left_out[: len(moving.left_out) + 1 - replacing.KEPT]
-    moving.left_out.append(replacing.LeftOut(y, R, done.e[0, : len(y)]))
+    moving.left_out.append(replacing.RejectedFix(y, R, done.e[0, : len(y)]))
     size, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
     mean = state.map.mean(moving.slot)
     found = replacing.replaced(mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out)

@@ -21,7 +21,7 @@ from kalmark.events import Id
 from kalmark.filter.estimators import Update
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.management import ambiguous_tags, confirm, merge, wall_growth
-from kalmark.report import Judged, Observation
+from kalmark.report import JudgedScan, Observation
 from kalmark.slam.policy import Policy
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import State
@@ -111,7 +111,7 @@ def _keep(state: State, scan: ScanContext, most: int, waiting: dict[int, Track])
         track.measurements.append(scan.measurement(k, clone))
 
 
-def contest(state: State, scan: ScanContext, model: ObservationModel, group: Judged, misfits: Flags, odds: float
+def contest(state: State, scan: ScanContext, model: ObservationModel, group: JudgedScan, misfits: Flags, odds: float
 ) -> None:  # fmt: skip
     """Weigh where the `misfits` (K,) of a group of observations with ids have their landmarks against where these are.
 

@@ -55,7 +55,7 @@ def without_detectors(robots: Iterable[Robot]) -> list[Robot]:
 
 
 @runtime_checkable
-class Compiling(Protocol):
+class CompilingDetector(Protocol):
     """A detector that compiles what it needs before its first scan."""
 
     def warm_up(self) -> None:
@@ -66,7 +66,7 @@ def warm_up_detectors(robots: Iterable[Robot]) -> None:
     """Let the detectors of robots compile what they need."""
     for robot in robots:
         for mount in robot.sensors.values():
-            if isinstance(mount.detector, Compiling):
+            if isinstance(mount.detector, CompilingDetector):
                 mount.detector.warm_up()
 
 

@@ -25,7 +25,7 @@ from kalmark.filter.compressed import immediate
 from kalmark.filter.compressed.drift import Drift
 from kalmark.filter.compressed.full_update import FullUpdate, Interval, Workspace
 from kalmark.filter.compressed.immediate import Displacements, ImmediateCorrections, Points, carried
-from kalmark.filter.compressed.inactive_search import Search
+from kalmark.filter.compressed.inactive_search import InactiveSearch
 from kalmark.filter.compressed.joint_reads import carried_along, joined, split
 from kalmark.filter.compressed.schedule import PREFAULT, SLICE, Schedule
 from kalmark.filter.compressed.storage import PANEL, Triangle
@@ -81,7 +81,7 @@ class CompressedMap(Layout):
         self._turns: dict[tuple[int, int], Index] = {}  # and the rows of the turn of the world in them
         self.drift, self.schedule, self._points = Drift(), Schedule(self.most), Points()
         self._immediate, self._before = ImmediateCorrections(), NO_NUMBERS
-        self._search = Search()
+        self._search = InactiveSearch()
 
     @classmethod
     def of_blocks(

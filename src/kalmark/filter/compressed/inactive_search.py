@@ -114,7 +114,7 @@ class Region(NamedTuple):
     spread: Array
 
 
-class Search:
+class InactiveSearch:
     """A tree of the blocks of one compression interval, made when it is first asked."""
 
     def __init__(self) -> None:
