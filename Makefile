@@ -9,7 +9,7 @@ demo: $(VENV)/base.stamp
 	$(BIN)/kalmark demo
 
 test: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # the oldest versions that pyproject.toml allows
 lowest: $(VENV)-lowest/stamp

@@ -287,6 +287,7 @@ def is_own(model: Any) -> bool:
     return model.__module__.split(".")[0] == "kalmark"
 
 
+@cache
 def world_of_class(model: Any) -> str:
     """Return "plane" or "space", where a model's class lives, "" for either."""
     named = {name: value for each in reversed(model.__mro__) for name, value in vars(each).items()}

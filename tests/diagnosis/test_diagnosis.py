@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +48,25 @@ def world_of(*settings: str) -> Any:
     return load_world("random_field", [*WORLD, *settings])
 
 
+@cache
+def log_of(seed: int = 3) -> Log:
+    """Return the log of the world, simulated once."""
+    return simulate(world_of(), seed)
+
+
+@cache
 def run_of(change: Change | None = None, settings: tuple[str, ...] = (), seed: int = 3) -> Run:
     """Return the run of a world's log, changed, by a filter with other settings."""
-    log, config = simulate(world_of(), seed), world_of(*settings).config()
+    log, config = log_of(seed), world_of(*settings).config()
     if change is not None:
         log = replace(log, events=sorted(map(change, log.events), key=lambda e: e.t_ns))
     return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+
+
+@cache
+def verdict_on(change: Change | None = None, settings: tuple[str, ...] = (), seed: int = 3) -> Verdict:
+    """Return the verdict on such a run, which many tests read."""
+    return km.diagnose(run_of(change, settings, seed))
 
 
 def seen(scan: Scan, y: Any = None, t_ns: int | None = None) -> Scan:
@@ -86,7 +100,7 @@ MISTAKES: dict[str, tuple[Change | None, tuple[str, ...]]] = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_named_first_with_its_size(name: str) -> None:
     change, settings, size = FAULTS[name]
-    verdict = km.diagnose(run_of(change, settings))
+    verdict = verdict_on(change, settings)
     assert verdict.causes[0].name == name, verdict.causes
     assert verdict.search is not None
     finding = next(f for f in verdict.search.found if f.name == name)
@@ -97,14 +111,14 @@ def test_a_fault_is_named_first_with_its_size(name: str) -> None:
 @pytest.mark.parametrize("name", ["range_sigma", "bearing_offset", "range_scale", "mount_position"])
 def test_the_cure_of_a_fault_takes_it_out(name: str) -> None:
     change, settings, _ = FAULTS[name]
-    cure = km.diagnose(run_of(change, settings)).causes[0].cure
+    cure = verdict_on(change, settings).causes[0].cure
     after = km.diagnose(run_of(change, (*settings, cure.removeprefix("--set "))))
     assert name not in [cause.name for cause in after.causes]
 
 
 def run_with_moved(ids: list[int], by: tuple[float, float]) -> Run:
     """Return the run of a log in which landmarks are moved in the middle."""
-    log, rng = simulate(world_of(), 3), np.random.default_rng(0)
+    log, rng = log_of(), np.random.default_rng(0)
     middle, truth = log.events[len(log.events) // 2].t_ns, log.truth["rover"]
 
     def other(e: Event) -> Event:
@@ -145,13 +159,13 @@ def test_a_log_that_does_not_fit_is_not_ok_where_there_is_no_batch_solution(monk
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_is_named_first_and_makes_the_map_wrong(name: str) -> None:
-    verdict = km.diagnose(run_of(*MISTAKES[name]))
+    verdict = verdict_on(*MISTAKES[name])
     assert (verdict.map, verdict.causes[0].name) == ("wrong", name)
 
 
 def test_a_clean_log_is_not_accused() -> None:
     for seed in range(5):
-        verdict = km.diagnose(run_of(seed=seed))
+        verdict = verdict_on(seed=seed)
         assert (verdict.map, verdict.causes) == ("ok", ())
         assert verdict.sigma_factor == pytest.approx(1.0, abs=0.1)
 
@@ -165,7 +179,7 @@ def test_a_part_of_the_observations_is_enough() -> None:
 
 
 def test_a_robot_that_was_carried_away_is_noticed_at_that_time() -> None:
-    log = simulate(world_of(), 3)
+    log = log_of()
     begin, end = (log.events[k * len(log.events) // 5].t_ns for k in (2, 3))
     events: list[Event] = [e for e in log.events if e.t_ns < begin]
     for e in log.events:
@@ -184,7 +198,7 @@ def test_a_robot_that_was_carried_away_is_noticed_at_that_time() -> None:
 
 def bumped(seed: int, by: tuple[float, float, float], when: float = 0.5) -> tuple[Log, float]:
     """Return a log in which the robot is moved `by` a step, in its frame, and the time of that."""
-    log, rng = simulate(world_of(), seed), np.random.default_rng(seed)
+    log, rng = log_of(seed), np.random.default_rng(seed)
     t_ns, truth = log.events[int(when * len(log.events))].t_ns, log.truth["rover"]
     before = truth.poses[np.searchsorted(truth.t_ns, t_ns)]
     to = compose(compose(before, np.array(by))[0], inverse(before)[0])[0]
@@ -226,7 +240,7 @@ def test_a_robot_that_is_carried_far_is_kidnapped_and_no_odometry_jumps() -> Non
 
 
 def test_a_control_that_jumps_is_named_and_its_cure_leaves_it_out() -> None:
-    log = simulate(world_of(), 3)
+    log = log_of()
     t_ns = next(e.t_ns for e in log.events[len(log.events) // 2 :] if isinstance(e, Control))
     jumps = [
         Control(t_ns=e.t_ns, robot=e.robot, u=np.array([25.0, 0.0])) if isinstance(e, Control) and e.t_ns == t_ns else e
@@ -245,7 +259,7 @@ def test_a_control_that_jumps_is_named_and_its_cure_leaves_it_out() -> None:
 
 
 def test_a_slip_while_there_are_no_scans_is_found_by_a_part_of_the_observations() -> None:
-    log = simulate(world_of(), 3)
+    log = log_of()
     middle, fast = log.events[len(log.events) // 2].t_ns, np.array([6.0, 1.5])
     within = [e for e in log.events if not isinstance(e, Scan) or not middle <= e.t_ns < middle + 8_000_000_000]
     slips = [
@@ -288,7 +302,7 @@ def test_controls_that_jump_among_surveyed_tags_are_named_without_a_batch_soluti
 def test_control_noise_and_gaps_are_no_jumps() -> None:
     noisy = run_of(None, tuple(f"robots.rover.motion.sigma_{c}=0.0167" for c in ("v_mps", "w_radps")))
     assert {cause.name for cause in km.diagnose(noisy).causes} == {"control_sigma"}
-    log = simulate(world_of(), 3)
+    log = log_of()
     begin = log.events[len(log.events) // 2].t_ns
     log = replace(log, events=[e for e in log.events if not begin <= e.t_ns < begin + 4_000_000_000])
     for gaps in ("widen", "ignore"):
@@ -311,7 +325,7 @@ def surveyed(folder: Path, log: Log, sigma_m: float, wrong: dict[int, tuple[floa
 def test_surveyed_landmarks_that_are_elsewhere_are_named_with_their_place(
     tmp_path: Path, sigma_m: float, gate: str
 ) -> None:
-    log = simulate(world_of(), 3)
+    log = log_of()
     ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
     often = sorted({*ids}, key=lambda i: (-ids.count(i), i))
     association = f"filter.association={{type: identity, gate: {gate}}}"
@@ -332,7 +346,7 @@ def test_surveyed_landmarks_that_are_elsewhere_are_named_with_their_place(
 
 @pytest.mark.parametrize("sigma_m", [0.0, 0.02, 0.5])
 def test_a_survey_that_is_right_is_not_accused(tmp_path: Path, sigma_m: float) -> None:
-    log = simulate(world_of(), 3)
+    log = log_of()
     run = recorded(log, surveyed(tmp_path, log, sigma_m, {}))
     for most in (20_000, 2000):
         verdict = km.diagnose(run, most)
@@ -353,7 +367,7 @@ def with_fixes(log: Log) -> Log:
 
 @pytest.mark.parametrize("heading", [0.5, 1.0, -2.5])
 def test_a_wrong_first_heading_is_named_where_fixes_tell(heading: float) -> None:
-    log = with_fixes(simulate(world_of(), 3))
+    log = with_fixes(log_of())
     start = f"robots.rover.start={{x_m: 12, y_m: 12, theta_rad: {heading}}}"
     verdict = km.diagnose(recorded(log, start))
     assert (verdict.map, verdict.causes[0].name, verdict.causes[0].harmless) == ("ok", "start", True)
@@ -439,7 +453,7 @@ def test_several_robots_that_start_elsewhere_are_named_together(each: bool, tmp_
 
 
 def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:
-    log = simulate(world_of(), 3)
+    log = log_of()
     start = "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0.6}"
     for sigma_m in (0.0, 0.05):
         verdict = km.diagnose(recorded(log, start, surveyed(tmp_path, log, sigma_m, {})))
@@ -447,14 +461,14 @@ def test_a_wrong_first_heading_is_named_in_a_known_map(tmp_path: Path) -> None:
 
 
 def test_a_start_that_may_be_anywhere_is_not_said_to_be_surer(tmp_path: Path) -> None:
-    log = simulate(world_of(), 3)
+    log = log_of()
     start = "robots.rover.start={x_m: 12, y_m: 12, sigma_xy_m: 10, sigma_theta_rad: 3}"
     verdict = km.diagnose(recorded(log, start, surveyed(tmp_path, log, 0.0, {})))
     assert (verdict.map, verdict.causes) == ("ok", ())
 
 
 def test_a_landmark_that_began_with_an_outlier_is_begun_again_and_named() -> None:
-    log, begun = simulate(world_of(), 3), set[Any]()
+    log, begun = log_of(), set[Any]()
 
     def first_off(e: Event) -> Event:
         if not isinstance(e, Scan) or e.ids is None or not len(e.y):
@@ -473,7 +487,7 @@ def test_a_landmark_that_began_with_an_outlier_is_begun_again_and_named() -> Non
 
 
 def test_observations_that_have_the_id_of_another_landmark_are_named() -> None:
-    log, rng = simulate(world_of(), 3), np.random.default_rng(3)
+    log, rng = log_of(), np.random.default_rng(3)
     events: list[Event] = []
     for e in log.events:
         event = e
@@ -501,7 +515,7 @@ def test_ranges_that_are_off_among_near_landmarks_do_not_have_wrong_ids() -> Non
 
 
 def test_errors_that_last_under_a_noise_that_is_stated_too_large_are_no_systematic_errors() -> None:
-    log, rng, last = simulate(world_of(), 3), np.random.default_rng(3), dict[Any, Any]()
+    log, rng, last = log_of(), np.random.default_rng(3), dict[Any, Any]()
 
     def lasting(e: Event) -> Event:
         if not isinstance(e, Scan) or e.ids is None or not len(e.y):
@@ -521,12 +535,12 @@ def test_errors_that_last_under_a_noise_that_is_stated_too_large_are_no_systemat
 
 
 def test_the_first_line_of_a_verdict_names_the_cause() -> None:
-    verdict = km.diagnose(run_of(*MISTAKES["bearing_sign"])).as_dict()
+    verdict = verdict_on(*MISTAKES["bearing_sign"]).as_dict()
     assert next(verdict_lines(verdict)) == "the map is wrong because of bearing_sign"
 
 
 def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidnapped() -> None:
-    log, config = simulate(world_of(), 3), world_of().config()
+    log, config = log_of(), world_of().config()
     ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
     a, b = sorted({*ids}, key=lambda i: (-ids.count(i), i))[:2]
     begin = log.events[len(log.events) // 2].t_ns
@@ -676,7 +690,7 @@ def test_the_textbook_filter_is_named_as_what_is_too_sure() -> None:
 
 
 def test_a_verdict_in_words_is_short_or_whole() -> None:
-    causes = tuple(km.diagnose(run_of(*FAULTS["bearing_offset"][:2])).causes) * 5
+    causes = tuple(verdict_on(*FAULTS["bearing_offset"][:2]).causes) * 5
     verdict = Verdict("doubtful", causes, "", 2.0, 0.1, 0.3).as_dict()
     assert len([*verdict_lines(verdict)]) == 5
     assert len([*verdict_lines(verdict, None)]) == 1 + len(causes)
@@ -808,7 +822,7 @@ def test_a_gate_that_is_tight_makes_no_noise_too_large() -> None:
 
 
 def test_the_accuracy_that_is_told_has_what_a_systematic_error_does_to_the_map() -> None:
-    verdict = km.diagnose(run_of(*FAULTS["range_scale"][:2]))
+    verdict = verdict_on(*FAULTS["range_scale"][:2])
     assert verdict.search is not None
     linear = verdict.search.linear
     places = linear.state.groups[LANDMARKS][:, :2]
