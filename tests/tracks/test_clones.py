@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import kalmark as km
-from kalmark.tracks.clones import Clones
+from kalmark.tracks.clones import Clones, Measurement
 
 EYE, RADIO = ("r", "eye"), ("r", "radio")
 RANGE = km.sensors.Range(0.1)
@@ -99,3 +99,20 @@ def test_clones_are_saved(tmp_path: Path) -> None:
         one.process(ranges(0.0, "radio", 2))
         assert len(one.clones.clones) == 1, "the robot has not moved"
     assert [vars(clone) for clone in again.clones.clones.values()] == [vars(c) for c in slam.clones.clones.values()]
+
+
+def test_the_clone_of_now_is_the_last_one_of_that_time_until_the_robot_moves() -> None:
+    clones = Clones()
+    assert clones.now("r", 10) is None
+    numbers = {name: clones.enter(slot, name, 10) for name, slot in (("r", 7), ("s", 8))}
+    assert (clones.now("r", 10), clones.now("s", 10), clones.now("r", 11)) == (numbers["r"], numbers["s"], None)
+    assert clones[numbers["s"]] == 8
+    clones.moved("r")
+    assert (clones.now("r", 10), clones.now("s", 10)) == (None, numbers["s"])
+    assert clones.refer(EYE, [numbers["r"]]) == [8], "nothing refers to the other one"
+    assert clones.now("s", 10) is None
+
+
+def test_a_measurement_is_named_by_its_place_in_the_log() -> None:
+    one = Measurement(3, 10, "r", "eye", 2, np.zeros(1), np.eye(1), False)
+    assert one.late == (10, "r", "eye", 2)

@@ -1,0 +1,115 @@
+"""The start in a known map, step by step: bases, poses of two pairs, tests, refinement, chance, ambiguity."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2
+
+import kalmark as km
+from kalmark.association import global_start
+from kalmark.association.global_start import (
+    REACH,
+    GlobalPose,
+    bases,
+    by_chance,
+    distinct,
+    hypotheses,
+    placed,
+    refined,
+    search,
+)
+from kalmark.association.relocalization import aligned, same
+from kalmark.geometry.frames import to_frame
+from kalmark.tracks.known_landmarks import Known
+
+PLACES = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [9.0, 1.0], [5.0, 8.0], [-6.0, 3.0]])
+T = np.array([1.0, -2.0, 0.7])
+SIGMA = np.full(6, 0.01)
+
+
+def known(places: np.ndarray) -> Known:
+    of = Known(km.landmarks.Point2D())
+    for i, place in enumerate(places):
+        of.add(i, place)
+    return of
+
+
+def test_pairs_that_are_far_apart_come_first_and_no_observation_is_in_most() -> None:
+    line = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [10.0, 0.0]])
+    assert bases(line, np.ones(4)) == [(0, 3), (1, 3), (0, 2), (1, 2)]
+    assert bases(line, np.array([1.0, 1.0, 0.01, 1.0]))[0] == (2, 3), "8 m of one sigma are more than 10 of two"
+    many = np.random.default_rng(0).uniform(-9, 9, (30, 2))
+    assert len(bases(many, np.ones(30))) == 8
+
+
+def test_two_observations_are_of_two_landmarks_from_two_poses() -> None:
+    """Only one pair of landmarks is 3 m apart: from the origin, and from the other one, turned about."""
+    found = hypotheses(known(PLACES[:3]), np.array([[0.0, 0.0], [3.0, 0.0]]), SIGMA[:2], 0, 1)
+    np.testing.assert_allclose(sorted(found.tolist()), [[0.0, 0.0, 0.0], [3.0, 0.0, np.pi]], atol=1e-12)
+
+
+def test_places_are_turned_and_shifted() -> None:
+    poses = np.array([[1.0, 2.0, np.pi / 2], [0.0, 0.0, np.pi]])
+    np.testing.assert_allclose(placed(poses, np.array([[1.0, 0.0]])), [[[1.0, 3.0]], [[-1.0, 0.0]]], atol=1e-12)
+
+
+def test_a_pose_that_most_of_a_scan_agrees_with_is_kept_with_its_pairs() -> None:
+    v = to_frame(T, PLACES[[1, 3, 4]])[0]
+    poses = np.array([T + np.array([0.0, 0.0, 0.3]), T])
+    (one,) = global_start.tested(known(PLACES), v, SIGMA[:3], poses, (0, 1))
+    np.testing.assert_array_equal(one.T, T)
+    assert one.matched.tolist() == [1, 3, 4]
+
+
+def test_a_pose_is_refined_to_the_least_squares_of_all_pairs_and_each_landmark_has_one() -> None:
+    rng = np.random.default_rng(1)
+    v = to_frame(T, PLACES)[0] + rng.normal(size=(6, 2)) * 0.01
+    v = np.vstack([v, v[2] + 0.02])  # a second one of the third landmark, farther off
+    sigma = np.full(7, 0.01)
+    start = GlobalPose(T + np.array([0.02, -0.02, 0.002]), np.array([0, 1, 2, 3, -1, -1, -1]))
+    found = refined(known(PLACES), v, sigma, start)
+    assert found.matched.tolist()[:6] == [*range(6)]
+    assert found.matched[6] == -1
+    again = aligned(v[:6], PLACES, sigma[:6] ** -2)
+    np.testing.assert_allclose(found.T, again, atol=0.01)
+    assert np.abs(found.T - T).max() < 0.02
+
+
+def test_poses_are_one_within_half_a_metre_and_a_tenth_of_a_radian() -> None:
+    assert same(T, T + np.array([0.3, 0.39, 0.0])) and not same(T, T + np.array([0.3, 0.41, 0.0]))
+    assert same(T, T + np.array([0.0, 0.0, 0.099])) and not same(T, T + np.array([0.0, 0.0, 0.101]))
+    assert same(np.array([0.0, 0.0, 3.13]), np.array([0.0, 0.0, -3.13])), "across the seam"
+    poses = [
+        GlobalPose(T + np.array([0.1, 0, 0]), np.array([0, -1])),
+        GlobalPose(T, np.array([0, 1])),
+        GlobalPose(T + np.array([9, 0, 0]), np.array([-1, -1])),
+    ]
+    assert [pose.pairs for pose in distinct(poses)] == [2, 0]
+
+
+def test_matchings_by_chance_are_the_tail_of_a_binomial() -> None:
+    of, v = known(PLACES), np.zeros((7, 2))
+    p = of.density() * np.pi * chi2.ppf(REACH, 2) * 2 * 0.3**2
+    assert 0 < p < 1
+    for count in (3, 5, 7):
+        assert by_chance(of, v, np.full(7, 0.3), count, 40) == pytest.approx(40 * binom.sf(count - 3, 5, p))
+
+
+def test_a_scan_that_fits_in_one_place_gives_its_pose() -> None:
+    found = search(known(PLACES), to_frame(T, PLACES)[0], SIGMA)
+    assert isinstance(found, GlobalPose)
+    np.testing.assert_allclose(found.T, T, atol=1e-9)
+    assert found.matched.tolist() == [*range(6)]
+
+
+def test_a_scan_that_does_not_determine_a_pose_is_refused_with_the_reason() -> None:
+    square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
+    corners = to_frame(T, square)[0]
+    assert search(known(square), corners[:2], SIGMA[:2]) == "its scan has 2 observations, a start needs 3"
+    alike = "its scan fits 4 landmarks from another pose, and 4 from this one"
+    assert search(known(square), corners, SIGMA[:4]) == alike
+    elsewhere = np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 70.0]])
+    assert search(known(PLACES), elsewhere, SIGMA[:3]) == "no pose in the known map explains its scan"
+    strange = np.vstack([to_frame(T, PLACES[:3])[0], [[50.0, 50.0], [70.0, -40.0], [-60.0, 33.0]]])
+    assert search(known(PLACES), strange, SIGMA) == "at most 3 of its 6 observations agree with a pose in the known map"
