@@ -322,8 +322,8 @@ def real(only: str) -> None:
         if only not in name:
             continue
         config_, log = open_run(config[0], None, config[1:])
-        log = log.without_truth()
-        verdict = diagnose(record(build_slam(config_, log), log, progress=False, config=config_dict(config_)))
+        slam, log = build_slam(config_, log), log.without_truth()  # several robots have the starts that the truth has
+        verdict = diagnose(record(slam, log, progress=False, config=config_dict(config_)))
         told = [f"{cause.name} ({cause.score:.0f})" for cause in verdict.causes if not cause.harmless]
         missing = known - {cause.name for cause in verdict.causes}
         factor = "-" if verdict.sigma_factor is None else f"{verdict.sigma_factor:.2f}"
