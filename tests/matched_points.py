@@ -5,6 +5,7 @@ An observation at v of a landmark at l has the innovation z = v - l, and all of 
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,8 @@ class Asked:
     def __init__(self, points: Points, names: list[Any], ids: Any = None, adrift: bool = False) -> None:
         self.points, self.names, self.y = points, names, points.v
         self.ids = (None,) * len(points.v) if ids is None else ids
-        self.scan = type("Scan", (), {"adrift": adrift})()
+        tracks = SimpleNamespace(confirmed=names, known=())
+        self.scan = SimpleNamespace(adrift=adrift, dimensions=2, tracks=tracks)
         self.learned = self.time = 0.0
 
     def dof(self) -> int:

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from kalmark.association.ratio import LogRatios, doubtful, log_ratios
+import kalmark as km
+from kalmark.association.ratio import LogRatios, doubtful, log_density_about, log_ratios
+from kalmark.filter.map import StochasticMap
+from kalmark.geometry import POINT2
+from kalmark.tracks.track import Track, Tracks
 
 
 def normal(z: np.ndarray, Z: np.ndarray) -> float:
@@ -55,3 +59,20 @@ def test_groups_are_accepted_at_their_joint_odds(
 ) -> None:
     found = LogRatios([*range(len(ratio))], np.array(ratio), np.array(bound))
     assert doubtful(found, given, 1000.0) == out
+
+
+def test_the_density_about_landmarks_is_that_of_those_observed_with_them_or_of_the_space_seen() -> None:
+    m, tracks, point = StochasticMap(), Tracks(["r"]), km.landmarks.Point2D()
+    places = {"a": (0.0, 0.0), "b": (3.0, 0.0), "c": (0.0, 4.0), "d": (10.0, 0.0), "e": (0.5, 0.0)}
+    for name, place in places.items():
+        tracks.confirm(Track(name, point, m.add(POINT2, place, np.eye(2))))
+    tracks.note_scan(["a", "b", "c"])  # e, as near as it is, may be a itself
+    sensor = np.array([10.0, 2.0, 0.3])
+    two, alone = math.log(2 / (math.pi * 4.0**2)), math.log(1 / (math.pi * 2.0**2))
+    assert log_density_about(m, tracks, ["a"], sensor) == pytest.approx(two)
+    assert log_density_about(m, tracks, ["d"], sensor) == pytest.approx(alone)
+    assert log_density_about(m, tracks, ["a", "a", "d"], sensor) == pytest.approx(two), "the median"
+    for name, place in (("k", (20.0, 0.0)), ("l", (20.0, 5.0))):
+        tracks.known.add(name, point, np.array(place))
+    known = math.log(1 / (math.pi * 5.0**2))
+    assert log_density_about(m, tracks, ["k"], sensor) == pytest.approx(known)

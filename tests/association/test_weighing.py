@@ -114,3 +114,24 @@ def test_what_no_landmark_explains_from_where_the_others_are_seen_is_new() -> No
     posts = [[0.0, 0.0], [2.0, 0.0], [0.0, 3.3]]
     points = Points([[0.4, 0.0], [2.4, 0.0], [1.0, 3.3]], posts, S=0.25)
     assert answers(km.association.Automatic(), points) == ["a", "b", Answer.NEW]
+
+
+def test_a_lost_robot_pairs_with_what_it_has_just_seen_and_maps_the_strange_anew() -> None:
+    d2 = np.array([[1.0, np.inf], [np.inf, 15.0], [np.inf, 30.0], [4.0, np.inf]])
+    pairs, reasons, mixed = km.association.Automatic().remapped(d2, 9.2, 23.0, {2: "why"})
+    assert (pairs.tolist(), reasons, mixed) == ([0, DEFERRED, REMAP, DEFERRED], {2: "why"}, None)
+
+
+def test_more_candidates_are_asked_for_until_each_observation_has_one_outside_its_gate() -> None:
+    """Of 60 landmarks on a line, 40 are within the gate of 99 % and 3.03 sigmas of 5 m."""
+    points = Points([[0.0, 0.0]], [[0.75 * k, 0.0] for k in range(-30, 30)], S=25.0, R=1e-4)
+    asked, counts = Asked(points, [*range(60)]), list[int]()
+
+    def candidates(nearest: int, farther: float) -> list[Any]:
+        counts.append(nearest)
+        return sorted(asked.names, key=lambda k: float(np.abs(points.l[k, 0])))[:nearest]
+
+    asked.candidates = candidates
+    names, d2 = km.association.Automatic().near(asked, np.arange(1), 9.21)
+    assert counts == [8, 32, 128]
+    assert (len(names), int((d2 <= 9.21).sum())) == (60, 41)

@@ -41,9 +41,9 @@ SENSOR = "robots.rover.sensors.lidar."
 MOTION = "robots.rover.motion."
 
 
-def written(folder: Path, seed: int = 3, **wrong: Any) -> Path:
+def written(folder: Path, seed: int = 3, steps: int = 450, **wrong: Any) -> Path:
     """Return a configuration with the right values but for these, beside its log."""
-    log = simulate(load_world("random_field", WORLD), seed)
+    log = simulate(load_world("random_field", [*WORLD, f"steps={steps}"]), seed)
     write_native(log, folder / "log")
     path = folder / "mine.yaml"
     path.write_text(CONFIG.format(**(RIGHT | wrong)))
@@ -118,7 +118,7 @@ def test_a_key_that_does_not_help_the_second_part_is_left(tmp_path: Path) -> Non
 
 
 def test_keys_to_keep_are_not_touched(tmp_path: Path) -> None:
-    tuning = tune(written(tmp_path, range=0.04), keep=[SENSOR + "sigma_range_m"])
+    tuning = tune(written(tmp_path, steps=120, range=0.04), keep=[SENSOR + "sigma_range_m"])
     assert SENSOR + "sigma_range_m" not in {one.key for one in tuning.changes}
 
 
@@ -168,7 +168,7 @@ def test_the_new_file_keeps_the_users_comments_and_runs(tmp_path: Path, capsys: 
 
 
 def test_what_cannot_be_tuned_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = written(tmp_path)
+    path = written(tmp_path, steps=120)
     with pytest.raises(KalmarkError, match=r"share 1\.5"):
         tune(path, share=1.5)
     with pytest.raises(KalmarkError, match="scans, expected 30"):
