@@ -60,6 +60,17 @@ def test_singular_covariances_are_left_out_whatever_their_scale() -> None:
     assert values[2] == pytest.approx(3e14)
 
 
+def test_two_noises_that_move_three_numbers_leave_a_singular_covariance_whatever_rounding_leaves_of_its_pivots() -> (
+    None
+):
+    """After its first control a pose has a covariance of rank 2."""
+    s = np.geomspace(1e-6, 0.7, 50)
+    G = np.zeros((50, 3, 2))
+    G[:, 0, 0] = G[:, 2, 1] = 1.0
+    G[:, 1] = np.stack([np.sqrt(1.0 - s**2), s], -1)
+    assert np.isnan(nees(np.ones((50, 3)), G @ G.transpose(0, 2, 1))).all()
+
+
 def test_the_nees_of_a_map_is_that_of_its_blocks_and_of_all_and_nothing_for_a_singular_covariance() -> None:
     rng, n, first, sizes = np.random.default_rng(2), 14, np.array([3, 5, 11]), np.array([2, 6, 3])
     A = rng.standard_normal((n, n)) * np.logspace(-2, 2, n)[:, None]

@@ -22,7 +22,7 @@ from kalmark.geometry.gaussian import quantile
 from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inverse, log, multiply
 from kalmark.results.history import Ints
 
-SINGULAR = 1e-12  # a pivot of a correlation matrix up to which it counts as singular
+SINGULAR = 1e-12  # 1 / tr C^-1, at most the smallest eigenvalue of a correlation matrix C, up to which it is singular
 FEW = 8  # numbers of an error up to which a Cholesky factor takes less time without LAPACK
 MAP_NEES = ("landmarks", "landmarks_world", "landmarks_dof", "joint", "joint_world", "joint_dof")
 """The NEES of landmarks (the mean) and of the joint state, in own and in world coordinates, and degrees of freedom."""
@@ -230,11 +230,11 @@ def factorize(S: Array, n: int) -> bool:
 def write_nees(d: Array, P: Array, at: int, n: int, out: Array) -> None:
     """Write the NEES (E,) of E errors d (E, .), of their n numbers from `at` on, whose covariance P has in these rows.
 
-    Of P the lower triangle is read.  NaN where P is singular.  By the Cholesky factor L of the correlation with the
-    scaled errors as more rows: there it has L^-1 d.
+    Of P the lower triangle is read.  NaN where P is singular.  By the Cholesky factor L of the correlation C with the
+    scaled errors and the unit matrix as more rows: there it has L^-1 d and L^-1, whose squares sum up to tr C^-1.
     """
     E = len(d)
-    S, sigma = np.zeros((n + E, n + E)), np.empty(n)
+    S, sigma = np.zeros((2 * n + E, 2 * n + E)), np.empty(n)
     out.fill(np.nan)
     for i in range(n):
         variance = P[at + i, at + i]
@@ -245,13 +245,12 @@ def write_nees(d: Array, P: Array, at: int, n: int, out: Array) -> None:
             S[i, j] = P[at + i, at + j] / (sigma[i] * sigma[j])
         for c in range(E):
             S[n + c, i], S[n + c, n + c] = d[c, at + i] / sigma[i], 1e300
+        S[n + E + i, i], S[n + E + i, n + E + i] = 1.0, 1e300
     if not factorize(S, n):
         return
+    inverse = np.sum(S[n + E :, :n] ** 2)
     for c in range(E):
-        value = 0.0
-        for i in range(n):
-            value += S[n + c, i] ** 2 if S[i, i] ** 2 > SINGULAR else np.nan
-        out[c] = value
+        out[c] = np.sum(S[n + c, :n] ** 2) if inverse * SINGULAR < 1.0 else np.nan
 
 
 @compiled
@@ -266,7 +265,7 @@ def all_nees(d: Array, P: Array) -> Array:
 def nees(d: Array, P: Array) -> Array:
     """Return d^T P^-1 d (...) for errors (..., n) and covariances (..., n, n); NaN where P is singular.
 
-    Singular: a variance that is not positive, or a pivot of the correlation matrix below 1e-12.
+    Singular: a variance that is not positive, or tr C^-1 above 1e12, C being the correlation matrix.
     """
     P = np.ascontiguousarray(P, dtype=np.float64)
     return all_nees(rows(d, P.shape[:-1])[:, None], P.reshape(-1, *P.shape[-2:])).reshape(P.shape[:-2])
