@@ -358,7 +358,7 @@ def weighed(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     head, p = head_sizes(blocks, atoms, robot, mount)[1], R.shape[1]
     _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     for i in range(len(y)):
-        if np.isnan(z[i]).any():  # nothing can be expected of it: it says nothing of the others
+        if np.isnan(z[i]).any():  # it has no expectation: it does not change the others
             z[i], E_r[i], E_l[i] = 0.0, 0.0, 0.0
     P_ss, H, v, inflated = submatrix(P, index), stacked(E_r, E_l, len(index)), raveled(z), R.copy()
     r = np.empty((len(y), p))

@@ -28,8 +28,8 @@ class Update(NamedTuple):
     """One correction: y (K, m) with noise R (K, p, p), of the first d numbers of the K blocks `slots`.
 
     `model` is the observation model, compiled (a tuple) or in Python; `robot` and `mount` are slots, `mount` -1 if it
-    is not in the map.  What has d2 > gate is not fused.  With `parallax`, inverse distances are corrected by the
-    parallax that they stand for, if the estimator iterates; a sensor that finds depth measures the distances.
+    is not in the map.  Observations with d2 > gate are not fused.  With `parallax`, inverse distances are corrected by
+    the parallax that they stand for, if the estimator iterates; a sensor that finds depth measures the distances.
     """
 
     model: Any
@@ -78,7 +78,7 @@ class Correction(NamedTuple):
 
 
 class Estimator(Protocol):
-    """How motions and scans change the map."""
+    """Prediction and correction of the map by motions and scans."""
 
     coordinates: ClassVar[str]
     default_gate: ClassVar[float]
@@ -114,7 +114,7 @@ class Iterating(Protocol):
 
 @runtime_checkable
 class Averaging(Protocol):
-    """An estimator that can fuse the mean over matchings, as `km.association.Averaged` wants."""
+    """An estimator that can fuse the mean over matchings, as `km.association.Averaged` requires."""
 
     def average(self, map_: Map, update: Update, pairs: Index, weights: Array) -> tuple[Array, bool]:
         """Fuse the mean over matchings (H, K), numbers of slots or -1, of these weights (H,).

@@ -1,13 +1,14 @@
 """The blocks that a correction of the invariant filter turns, and their rotation.  docs/invariant.md.
 
-The map turns with the sensor that observes it: the gauge.  What leans on a lever arm, or on the heading of another
-inertial unit, turns with that.  With the rotation errors of the observing robot and of other units r, and an arm a,
+The map turns with the sensor that observes it: the gauge.  A vector that depends on a lever arm, or on the heading of
+another inertial unit, turns with that.  With the rotation errors of the observing robot and of other units r, and an
+arm a,
 
-    d = ... + L_a d_a + L_r (d_theta_r - d_theta) + what these do not explain
+    d = ... + L_a d_a + L_r (d_theta_r - d_theta) + residual
 
-of each vector of the world, by the covariance before the correction.  It becomes E d of the leaning part, E the turn
+of each vector of the world, by the covariance before the correction.  It becomes E d of the dependent part, E the turn
 of the robot that has the arm, or of r; a turn of the whole world changes no difference, so nothing is lost of it.
-Where the map turns with a sensor, the position of its robot leans on arm and rotation of the mount.
+Where the map turns with a sensor, the position of its robot depends on arm and rotation of the mount.
 """
 
 from __future__ import annotations
@@ -94,8 +95,8 @@ def turning_rows(table: Table, sizes: tuple[int, int, int, int, int, int], H: Ar
     """Return the rows of the observed block that turn the map: of the pose (axes,), of a mount, of other units.
 
     The map turns with the sensor that observes it, so with its mount (1 or 3 rows, if it is in the map).  A second
-    block that is no mount turns nothing, nor does one of a sensor that sees no directions: the columns of its rotation
-    in H are zero.  The rows of the mount's position (2 or 3) follow, the lever arm.
+    block that is no mount turns nothing, nor does one of a sensor that measures no directions: the columns of its
+    rotation in H are zero.  The rows of the mount's position (2 or 3) follow, the lever arm.
     """
     pose, head, axes, behind, others, _ = sizes
     dof, turns, last = (3, 1, 4) if pose == 3 else (6, 3, 5)  # last: of the atoms of a pose and a mount
@@ -154,11 +155,12 @@ def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
 
 @compiled
 def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array, rays: bool) -> Array:
-    """Return L (n, m): how each vector of some atoms leans on the m rows of a mount and of other units' rotations.
+    """Return L (n, m): regression of each vector of some atoms on the m rows of a mount and of other units' rotations.
 
     `B` (k, n) are the rows of P, before the correction, of all rows that turn; `index` are these rows, R that of the
-    robot's rotation.  The rotation of the sensor explains its part, too.  On a mount that turns the map leans the
-    position of its own robot alone, and with `rays` in the map nothing: their parallaxes count from that position.
+    robot's rotation.  The rotation of the sensor explains its part, too.  On a mount that turns the map the
+    position of its own robot alone depends, and with `rays` in the map no vector: their parallaxes count from that
+    position.
     """
     _rows, turns, arm = turning
     m, (t, s) = len(index) - axes, (1, 2) if axes == 1 else (3, 3)
@@ -166,7 +168,7 @@ def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R
     if m == 0:
         return L
     W = weights(B, index, axes - t)
-    for c in range(turns):  # what leans on the robot's rotation leans on the sensor's, d_theta + R_r d_theta_s
+    for c in range(turns):  # dependence on the robot's rotation is that on the sensor's, d_theta + R_r d_theta_s
         for a in range(t):
             for b in range(t + m):
                 W[t + c, b] -= R[a, c] * W[a, b]
@@ -192,7 +194,7 @@ def weights(B: Array, index: Index, first: int) -> Array:
 
 @compiled
 def vectors(kind: int) -> int:
-    """Return how many leading numbers of an atom are vectors of the world that may lean on what turns."""
+    """Return how many leading numbers of an atom are vectors of the world that may depend on rows that turn."""
     return 2 if kind == VECTOR else 0 if kind < 0 or kind == OWN else LINEAR[kind]
 
 
@@ -211,9 +213,9 @@ def rotation_of(turn: Array) -> tuple[Array, Array]:
 
 @compiled
 def turns_of(turn: Array, correction: Array, turning: Turning, axes: int) -> tuple[Array, Array, Array]:
-    """Return E - 1 and W - V (m, s, s) of the m rows that others lean on, and their errors (m,) by a correction.
+    """Return E - 1 and W - V (m, s, s) of the m rows that others depend on, and their errors (m,) by a correction.
 
-    A leaning part becomes E of it, and moves the mean by W, where a vector moves by V otherwise: V of the gauge's
+    A dependent part becomes E of it, and moves the mean by W, where a vector moves by V otherwise: V of the gauge's
     `turn`, E and W of the turn of the robot; that of another unit goes on from that of the gauge, and so does that of
     the robot where the map turns with its sensor.
     """
@@ -244,7 +246,7 @@ def turns_of(turn: Array, correction: Array, turning: Turning, axes: int) -> tup
 
 @compiled
 def carry(atoms: Table, x: Array, L: Array, W: Array, d: Array) -> None:
-    """Move the vectors of a mean x by what a correction d (m,) does to them by their leaning L (n, m)."""
+    """Move the vectors of a mean x by a correction d (m,) of the rows that they depend on by L (n, m)."""
     s = W.shape[1]
     for i in range(len(atoms)):
         at, k = atoms[i, 1], atoms[i, 2]
@@ -263,7 +265,7 @@ def displaced(
     """Return the columns (n, rows that turn) by which errors change from a mean to a corrected one.
 
     `now` and `then` (n, axes) are the generators there, `index` the rows that turn, R and R_now those of the robot's
-    rotation, before and now, d (m,) what the rows were corrected by that others lean on.  The errors of tilt of a unit
+    rotation, before and now, d (m,) the correction of the rows that others depend on.  The errors of tilt of a unit
     whose gravity is known, `level`, turn with its heading.
     """
     _rows, turns, arm = turning
@@ -308,7 +310,7 @@ def with_arm(out: Array, L: Array, d: Array, axes: int, turns: int) -> Array:
 def lean(out: Array, atoms: Table, L: Array, E: Array, axes: int, others: int, index: Index) -> None:
     """Set the last columns of `out` (n, .), those of a mount and from `others` on of other units, to (E - 1) L.
 
-    A vector of a unit's own turns with it by its generator, in the first columns, whatever it leans on.
+    A vector of a unit's own turns with it by its generator, in the first columns, whatever it depends on.
     """
     m, s, rotation = L.shape[1], E.shape[1], -1
     first = out.shape[1] - m

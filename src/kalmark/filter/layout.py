@@ -43,7 +43,7 @@ class Layout:
         self.n = 0  # rows of P in use
         self.x_n = 0  # numbers of x in use
         self._free: dict[tuple[int, ...], list[int]] = {}
-        self._rows: dict[int, Index] = {}  # by slot, as asked for so far; likewise the numbers
+        self._rows: dict[int, Index] = {}  # by slot, as computed so far; likewise the numbers
         self._numbers: dict[int, slice] = {}
 
     def rows(self, slot: int) -> Index:
@@ -141,7 +141,7 @@ class Layout:
         yield "x_first", self.x_first[: self.x_n]
 
     def removed(self, slot: Any) -> int:
-        """Return the slot of a block that a file tells to remove.  Raises MapError if there is none."""
+        """Return the slot of a block that a file lists as removed.  Raises MapError if there is none."""
         if type(slot) is not int or not 0 <= slot < len(self.spaces) or self.spaces[slot] is None:
             raise MapError(f"removed slot is {slot!r}, expected each one of {len(self.spaces)} once")
         return slot

@@ -21,7 +21,7 @@ from kalmark.filter.prefault import Prefault
 from kalmark.geometry.spaces import Space, Table
 
 NO_SLOTS = np.zeros(0, dtype=np.int64)
-AT_ONCE = 32  # inactive blocks to be read jointly, where the caller does not ask for it
+AT_ONCE = 32  # inactive blocks that are read jointly without a request of the caller
 
 
 class Marginal(NamedTuple):
@@ -91,7 +91,7 @@ class Map(Protocol):
         """
 
     def nearest(self, model: Any, scan: Seen, asked: Asked) -> Nearest | None:
-        """Return the wanted block that each observation can only be of; None where that takes more to tell.
+        """Return the only wanted block that each observation can be of; None where more is needed to decide that.
 
         `model` is compiled.
         """
@@ -187,7 +187,7 @@ class StochasticMap(Layout):
         return Pairs.of(slots, places, self.marginal(robot, mount, slots), p, nearest, farther)
 
     def nearest(self, model: Any, scan: Seen, asked: Asked) -> Nearest | None:
-        """Return the wanted block that each observation can only be of; None of a scan of which that is not clear."""
+        """Return the only wanted block that each observation can be of; None of a scan of which that is not clear."""
         clear, found = nearest(model, self.whole, scan, np.arange(len(self.blocks)), asked)
         return Nearest(*found) if clear else None
 

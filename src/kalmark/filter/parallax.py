@@ -60,7 +60,7 @@ def anchored(atoms: Table) -> Table:
 def spread(P: Array, head: Index, x: Array, s: Array, S: Array, table: Table) -> Array:
     """Return c2 = trace Cov(s - a) of each row of the table; `head` are the rows of P of the head.
 
-    In the plane it is that of t without its turn with the robot's heading, which tells nothing of its length.
+    In the plane it is that of t without its turn with the robot's heading, which does not change its length.
     """
     size, h = S.shape
     c2, rows, D = np.empty(len(table)), np.empty(h + size, np.int64), np.zeros((size, h + size))

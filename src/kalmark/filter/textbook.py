@@ -1,6 +1,6 @@
 """EKF-SLAM as the guide prints it: dense matrices, full-size Jacobians, nothing clever.  [S] 2 and C.3, [F] 11.3.
 
-This is the page to learn from and what every fast path is tested against.  It is not what `Slam` runs on.
+This is the reference that every fast path is tested against.  It is not what `Slam` runs on.
 """
 
 from __future__ import annotations

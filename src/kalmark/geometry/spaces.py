@@ -1,4 +1,4 @@
-"""Spaces the blocks of the map live in: products of a few atoms, each with plus, minus, rotated and generator.
+"""Spaces of the blocks of the map: products of a few atoms, each with plus, minus, rotated and generator.
 
 An atom is the smallest piece that a rotation of the world treats in its own way.  A block type is a list of atoms, so
 the filter handles any block, and a new kind of block needs no code in the filter:
@@ -59,7 +59,7 @@ KIND, X_AT, P_AT = 0, 1, 2  # columns of a table of atoms
 
 @compiled
 def retract_plane(atoms: Table, x: Array, d: Array, turn: Array) -> None:
-    """Move what lives in the plane, and plain numbers, as `retract` does."""
+    """Move atoms of the plane, and plain numbers, as `retract` does."""
     p, q = exponential_v(turn[0]) if len(turn) == 1 else (1.0, 0.0)
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
@@ -142,7 +142,7 @@ def _direction_generator(m: Array) -> Array:
 
 @compiled
 def generator_plane(atoms: Table, x: Array, size: int, axes: int, origin: Array) -> Array:
-    """Return how the errors (size, axes) of what lives in the plane move when the world turns, as `generator` does."""
+    """Return the generator (size, axes) of a rotation of the world, for atoms of the plane, as `generator` does."""
     g = np.zeros((size, axes))
     for i in range(len(atoms)):
         kind, at, k = atoms[i, 0], atoms[i, 1], atoms[i, 2]
@@ -248,7 +248,7 @@ class Space:
 
     @cached_property
     def world(self) -> str:
-        """Where it lives: "plane", "space", or "" for plain numbers, which fit either."""
+        """The world it belongs to: "plane", "space", or "" for plain numbers, which fit either."""
         if any(kind >= VECTOR3 and kind != RHO for kind in self.kinds):
             return "space"
         return "plane" if any(kind in (VECTOR, HEADING) for kind in self.kinds) else ""

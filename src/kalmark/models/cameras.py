@@ -14,7 +14,7 @@ OMNI             `project_omni`, `back_project_omni`                            
 
 Intrinsics are k = (fx, fy, cx, cy) in pixels.  `limit` is the radius on the plane z = 1 (EQUIDISTANT: the angle theta)
 at which the distortion stops growing and the image would fold over.  Pixels and Jacobians are NaN where a lens shows
-nothing: beyond the limit, and behind the camera (z <= 0; an EQUIDISTANT lens sees there too, up to its limit, and OMNI
+nothing: beyond the limit, and behind the camera (z <= 0; an EQUIDISTANT lens images that too, up to its limit, and OMNI
 gives a pixel to every direction).  `parameters` makes `par`.  The correction c of a radial distortion has the same form
 as that.  TSAI (1987) has a polynomial that takes the distortion off, limited in r_d; DAVISON (MonoSLAM, 2007) and FOV
 (Devernay and Faugeras, 2001) have one number.  OMNI is Scaramuzza's (2006): polynomials between the angle and the
@@ -444,7 +444,7 @@ def fit_correction(d: Any, k: Any, size: Any, tolerance_px: float = 0.005, radiu
 
     Least squares of pixels at Chebyshev nodes of r_d^2 from the centre to the farthest corner, or to `radius` on the
     plane z = 1.  Raise ModelError where that is more than the distortion can reach, or if 20 coefficients do not
-    suffice, as where the lens almost folds the image: then `radius` says how much of the image is to be used.
+    suffice, as where the lens almost folds the image: then `radius` limits the part of the image that is used.
     """
     d, k, size = (np.asarray(a, dtype=np.float64) for a in (d, k, size))
     if not d.any():

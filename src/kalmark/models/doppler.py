@@ -52,12 +52,12 @@ def moving(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[A
 
 @declared
 class _Doppler(Expecting):
-    """What all of them share: limits of sight, and what they expect."""
+    """Base of these sensors: limits of range, and the expectation."""
 
     sigma_rate_mps: Annotated[Positive, "Noise of the range rate."] = 0.1
     _: KW_ONLY
-    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
-    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
+    range_min_m: Annotated[NotNegative, "Nearest landmark that is measured."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
     fov_rad: Annotated[Positive, "Field of view about the sensor's x axis."] = 2 * math.pi
 
     world: ClassVar[str]
@@ -113,7 +113,7 @@ class Radar2D(_Doppler):
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad", "sigma_rate_mps")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return points (K, 2) and V_y (K, 2, 3): the rate tells nothing of the place.  [S] (62)."""
+        """Return points (K, 2) and V_y (K, 2, 3), zero for the rate.  [S] (62)."""
         p, P_y = inv_scan_many(np.ascontiguousarray(y[:, :2]))
         return p, np.concatenate([P_y, np.zeros((len(y), 2, 1))], axis=2)
 
@@ -141,7 +141,7 @@ class Radar3D(_Doppler):
     )  # fmt: skip
 
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return points (K, 3) and V_y (K, 3, 4): the rate tells nothing of the place."""
+        """Return points (K, 3) and V_y (K, 3, 4), zero for the rate."""
         p, P_y = inv_spherical_many(np.ascontiguousarray(y[:, :3]))
         return p, np.concatenate([P_y, np.zeros((len(y), 3, 1))], axis=2)
 

@@ -15,7 +15,7 @@ from kalmark.models.landmark_views import Spatial, constant
 
 __all__ = ["Omnidirectional", "PinHole", "PixelDepth", "Segments", "Stereo", "TagCorners"]
 
-TELLING = 12.0  # by so much chi-square the second pose of a tag must be worse for the first to be believed
+TELLING = 12.0  # least difference of the chi-squares of a tag's two poses for the first to be accepted
 FISHEYE = (400.0, -254.647909)  # 400 px at 90 degrees from the axis, in proportion to the angle
 FISHEYE_BACK = (
     254.647909, 0.0, -0.00130899694, 0.0, -1.34575854e-09, 0.0, -1.97650363e-15, 0.0, -3.04801702e-21, 0.0,
@@ -114,7 +114,7 @@ class _Lens(_PinHole):
 
 @register("sensor", "pinhole")
 class PinHole(_Lens):
-    """A camera that sees points: pixels u, v.
+    """A camera that measures points: pixels u, v.
 
     [TB] pinHole.  `calibration` names a file of OpenCV, Kalibr, ROS or EuRoC instead: cameras.md.
     """
@@ -151,7 +151,7 @@ class PixelDepth(_Lens):
 
 @register("sensor", "omnidirectional")
 class Omnidirectional(_Camera):
-    """Scaramuzza's camera with a wide view that sees points: pixels u, v.
+    """Scaramuzza's camera with a wide view that measures points: pixels u, v.
 
     `cameras.project_omni` explains the polynomials.  [TB] omniCam.
     """
@@ -189,7 +189,7 @@ class Omnidirectional(_Camera):
 
 @register("sensor", "stereo")
 class Stereo(_PinHole):
-    """A rectified pair of cameras that sees points: u, v in the left image and u, v in the right one."""
+    """A rectified pair of cameras that measures points: u, v in the left image and u, v in the right one."""
 
     baseline_m: Annotated[Positive, "Distance of the right camera from the left one, whose frame is the sensor's."] = (
         0.2
@@ -233,7 +233,7 @@ class Stereo(_PinHole):
 
 @register("sensor", "segments")
 class Segments(_PinHole):
-    """A camera that sees line segments: pixels of both ends, which lie anywhere on the line.
+    """A camera that measures line segments: pixels of both ends, which lie anywhere on the line.
 
     So only the distances of the measured ends from the expected line count.  [TB] Fig. 9: the innovation is two
     distances, `ortDst`.
@@ -284,7 +284,7 @@ class Segments(_PinHole):
 
 @register("sensor", "tag_corners")
 class TagCorners(_Lens):
-    """A camera that sees square tags of known size: pixels of their four corners.
+    """A camera that measures square tags of known size: pixels of their four corners.
 
     Corners in the tag's frame: (-s, -s), (s, -s), (s, s), (-s, s), s half the size.
     """
@@ -301,14 +301,14 @@ class TagCorners(_Lens):
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the tags' poses (K, 7) in the camera, and V_y (K, 6, 8).
 
-        NaN where none explains the corners, and where two do: a small tag looks like its mirror image.
+        NaN where no pose explains the corners, and where two do: the planar pose ambiguity of a small tag.
         """
         v, V_y, chi2 = self.both(y)
         v[~(chi2[:, 1] - chi2[:, 0] >= TELLING)] = np.nan
         return np.ascontiguousarray(v[:, 0]), V_y[:, 0]
 
     def both(self, y: Array) -> tuple[Array, Array, Array]:
-        """Return the two poses (K, 2, 7) that look like y, the better first, V_y (K, 2, 6, 8), chi-squares (K, 2)."""
+        """Return the two poses (K, 2, 7) that fit y, the better first, V_y (K, 2, 6, 8), chi-squares (K, 2)."""
         corners, sizes = np.ascontiguousarray(y[:, :8]), np.ascontiguousarray(y[:, 8])
         par = np.array(self.parameters)
         rays = cameras.back_project(self.code, corners.reshape(-1, 2), par)[0].reshape(-1, 4, 3)
@@ -316,7 +316,7 @@ class TagCorners(_Lens):
         return v, V_y, cost / self.sigma_px**2
 
     def is_far(self, y: Array, z: Array) -> Flags:
-        """Tell which tags y (K, 9) are off by half their size or more by their innovations z (K, 8), or unexpected."""
+        """Return which tags y (K, 9) have innovations z (K, 8) of half their size or more, or not finite."""
         sides = np.diff(y[:, [0, 1, 2, 3, 4, 5, 6, 7, 0, 1]].reshape(-1, 5, 2), axis=1)
         size = np.linalg.norm(sides, axis=2).mean(axis=1)
         near: Flags = np.sqrt(np.sum(z**2, axis=1) / 4) < 0.5 * size

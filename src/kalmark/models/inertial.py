@@ -232,7 +232,7 @@ class InertialGravity(Inertial):
 
 # ------------------------------------------------------------------ at rest
 class Rest(NamedTuple):
-    """What readings at rest tell: until when it lasted, the state (size,) there and its covariance (dof, dof)."""
+    """A start from readings at rest: the end of the rest, the state (size,) there and its covariance (dof, dof)."""
 
     until_s: float
     start: Array
@@ -244,9 +244,9 @@ def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) ->
 
     `start` (size,) and `cov` (dof, dof) are what is known without them: position, heading and the prior of the biases
     are taken from there.  The tilt and the bias of the rate come from the means: the attitude of the start is turned
-    to the vertical by the shortest way.  A bias of the force looks like a tilt, so both are as uncertain as its prior
-    says, and correlated.  With the gravity in the state the attitude is the start's and the gravity is found instead.
-    Raises ModelError if the unit does not begin at rest.
+    to the vertical by the shortest way.  A bias of the force is not distinguishable from a tilt, so both have the sigma
+    of its prior and are correlated.  With the gravity in the state the attitude is the start's and the gravity is found
+    instead.  Raises ModelError if the unit does not begin at rest.
     """
     count = _resting(motion, t_s, u, np.sqrt(np.diag(cov)))
     until_s, dt_s = float(t_s[count - 1]), float(np.median(np.diff(t_s)))
@@ -286,7 +286,7 @@ def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) ->
 def shaken(t_s: Array, u: Array) -> tuple[float, float]:
     """Return the densities of white noise, of rate [rad/s/sqrt(Hz)] and force [m/s^2/sqrt(Hz)], of readings u (N, 6).
 
-    At `t_s` (N,).  A vehicle that shakes has more than the data sheet says.  Of the spectrum above what a vehicle
+    At `t_s` (N,).  A vehicle that shakes has more than the data sheet gives.  Of the spectrum above what a vehicle
     itself moves by, in bands, the least counts: a motor that hums has no part in it.  Zero of too few readings.
     """
     rate = 1.0 / float(np.median(np.diff(t_s))) if len(t_s) > 2 * SPECTRUM else 0.0

@@ -152,7 +152,7 @@ TurnBias = Annotated[Estimated, "Constant part of the turn rate's error"]
 
 
 class MotionModel(Compiled):
-    """What the motions share: white noise of a control, by the names of its parameters, and its calibration.
+    """Base of the motions: white noise of a control, by the names of its parameters, and its calibration.
 
     `calibrations` are the name and the parameter, a sigma, of each constant by which a control may be wrong.  Those
     with a sigma above 0 are in the map and are estimated.
@@ -198,7 +198,7 @@ class MotionModel(Compiled):
 
 @declared
 class PlanarMotion(MotionModel):
-    """What the planar motions share: the space and the diffusion."""
+    """Base of the planar motions: the space and the diffusion."""
 
     _: KW_ONLY
     sigma_along_m_per_sqrt_s: Annotated[NotNegative, "Random walk along the heading, while it moves."] = 0.0
@@ -245,7 +245,7 @@ class SpeedAndTurn(PlanarMotion):
 
 
 class Steered(PlanarMotion):
-    """What a car and a tricycle share: the speed of a wheel and a steering angle, each held until the next control."""
+    """Base of a car and a tricycle: the speed of a wheel and a steering angle, each held until the next control."""
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
     held: ClassVar[bool] = True

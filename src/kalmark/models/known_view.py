@@ -86,7 +86,7 @@ def linearize_known_in_space(view: View, head: Array, l: Array, y: Array) -> tup
 
 @compiled
 def linearize_known_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return e (K, m + n), z (K, p), E_h (K, p, h), E_l (K, p, 0) of a sensor that sees its velocity; y (K, m + n)."""
+    """Return e (K, m + n), z (K, p), E_h (K, p, h), E_l (K, p, 0) of a sensor with its own velocity; y (K, m + n)."""
     measured, known = split(y, len(view[6]))
     e, z, E_h, _E_l = linearize_moving(view, head, known, measured)
     return completed(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))

@@ -79,7 +79,7 @@ def with_distance(l: Array, rays: tuple[Array, Array, Array]) -> tuple[Array, Ar
 
 @compiled
 def oneself(T: Array, l: Array) -> tuple[Array, Array, Array]:
-    """Return where T itself is, (1, 2 or 3), V_T and V_l = 0: an absolute position fix looks at no landmark."""
+    """Return where T itself is, (1, 2 or 3), V_T and V_l = 0: an absolute position fix observes no landmark."""
     d = 2 if len(T) == 3 else 3
     V_T = np.zeros((1, d, 3 if d == 2 else 6))
     for j in range(d):
@@ -175,7 +175,7 @@ def tag_corners(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tu
 def raised(v: Array, height: float) -> Array:
     """Return views v (K, 2 or 3) in space (K, 3), from a sensor `height` m above the plane; in space that is 0.
 
-    What has no height of its own is in the plane.
+    A landmark without a height is in the plane.
     """
     k, d = v.shape
     p = np.empty((k, 3))
@@ -215,7 +215,7 @@ def constant(variances: tuple[float, ...], count: int) -> Array:
 
 
 class Sensing:
-    """What all sensors share: `columns`, and white noise whose `sigmas` are the parameters of these names."""
+    """Base of all sensors: `columns`, and white noise whose `sigmas` are the parameters of these names."""
 
     columns: ClassVar[tuple[str, ...]]
     sigmas: ClassVar[tuple[str, ...]]
@@ -241,7 +241,7 @@ class Expecting(Sensing):
 
     @property
     def code(self) -> int:
-        """What `expected` is told of the sensor: the lens of a camera, 0 for other sensors."""
+        """The first argument of `expected`: the lens of a camera, 0 for other sensors."""
         return 0
 
     @property
@@ -266,7 +266,7 @@ class Expecting(Sensing):
 
 
 class Spatial(Expecting):
-    """What sensors of space, and of walls, share."""
+    """Base of sensors of space, and of walls."""
 
     world: ClassVar[str] = "space"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
@@ -275,7 +275,8 @@ class Spatial(Expecting):
     def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
         """Return the expected measurements (K, m) of views v (K, d), and E_v (K, p, d or the view's errors).
 
-        `y` (K, m), what was measured, is needed where it tells what cannot be expected: a tag's size, a segment's ends.
+        The measurements `y` (K, m) are needed where they contain what has no expectation: a tag's size, a segment's
+        ends.
         """
         return self._expected(v, np.zeros((len(v), len(self.columns))) if y is None else y)
 
@@ -285,8 +286,8 @@ class Cone(Expecting):
     """Limits of sight about x, of points in three dimensions."""
 
     _: KW_ONLY
-    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
-    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
+    range_min_m: Annotated[NotNegative, "Nearest landmark that is measured."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
     fov_rad: Annotated[Positive, "Field of view, a cone about the sensor's x axis."] = 2 * math.pi
 
     def sees(self, v: Array) -> Flags:
@@ -316,7 +317,7 @@ class Distancing(Expecting):
 
 @declared
 class Raised(Distancing):
-    """Those on a robot of the plane, which sees landmarks at their own heights."""
+    """Those on a robot of the plane, with landmarks at their own heights."""
 
     _: KW_ONLY
     height_m: Annotated[Number, "Of the sensor above the plane of the map."] = 0.0

@@ -1,7 +1,7 @@
-"""Landmarks, and how they look from a pose: Euclidean and polar points, points of unknown depth, tags, lines.
+"""Landmarks and their views from a pose: Euclidean and polar points, points of unknown depth, tags, lines.
 
-A landmark of a kind that has a prior can be started by a sensor that does not see all of it: the prior says what is
-expected of the rest.  How they look from a sensor is in `landmarks2d`, `landmarks3d`, `lines` and `tags`.
+A landmark of a kind that has a prior can be started by a sensor that does not measure all of it: the prior is that
+of the rest.  The views from a sensor are in `landmarks2d`, `landmarks3d`, `lines` and `tags`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ __all__ = [
 
 TINY_M = 1e-12
 
-PriorDepth = Annotated[Number, "Inverse distance expected where the sensor sees none."]
+PriorDepth = Annotated[Number, "Inverse distance expected where the sensor measures none."]
 DepthSigma = Annotated[NotNegative, "Standard deviation of that."]
 
 
 class _Landmark:
-    """What the landmarks share: the compiled view `look`, of the form `seen.LOOK`, and the landmark of a view `of`."""
+    """Base of the landmarks: the compiled view `look`, of the form `seen.LOOK`, and the landmark of a view `of`."""
 
     look: ClassVar[Any]
     of: ClassVar[Any]
@@ -160,9 +160,9 @@ class Point3D(_Landmark):
 
 @declared
 class _Depth(_Landmark):
-    """A point whose depth no measurement need tell: inverse distance rho, `prior_rho_per_m` +- `sigma_rho_per_m`.
+    """A point whose depth no measurement need determine: inverse distance rho, `prior_rho_per_m` +- `sigma_rho_per_m`.
 
-    The prior is that of the first sight, by a sensor that sees a ray.
+    The prior is that of the first observation, by a sensor that measures a ray.
     """
 
     prior_rho_per_m: PriorDepth = 0.01
@@ -280,7 +280,7 @@ class Homogeneous(_Depth):
 
 @dataclass(frozen=True)
 class AsPoint:
-    """A point of unknown depth as a sensor that finds depth sees it: its Euclidean point."""
+    """A point of unknown depth for a sensor that measures depth: its Euclidean point."""
 
     ray: Any
 
@@ -331,7 +331,7 @@ class Tag(_Landmark):
 
 @declared
 class _Line(_Landmark):
-    """What the lines share: they start on the plane of two viewing rays, the rest is a prior (K, 2).
+    """Base of the lines: they start on the plane of two viewing rays, the rest is a prior (K, 2).
 
     With `extend`, the segment kept beside a line grows with what is seen of it; before, and without, it is what its
     first sight and the prior make it.  A segment whose ends are uncertain by more than `switch_px` follows the measured
@@ -390,7 +390,7 @@ class _DirectionPrior(_Line):
     """Lines whose direction in the plane of sight is a prior, beta = (`prior_beta_1`, 0) +- sigmas.  [TB] plkLin."""
 
     prior_beta_1: Annotated[
-        Number, "Direction expected in the plane of sight, which one image does not tell: first component."
+        Number, "Direction expected in the plane of sight, which one image does not determine: first component."
     ] = 0.1
     prior_beta_2: Annotated[Number, "Second component."] = 0.0
     sigma_beta_1: Annotated[NotNegative, "Standard deviation of the first component."] = 0.25

@@ -8,8 +8,8 @@ polar                anchor (2), direction alpha, d        anchor + d (cos alpha
 inverse depth        anchor (2), direction alpha, rho      anchor + (cos alpha, sin alpha) / rho
 ===================  ====================================  ===================================
 
-The second is for sensors whose bearings are so poor that what they see is an arc and no ellipse: [S] 2.3.5.  The
-third is for sensors that see no depth.  What such a sensor sees of it is v = rho (point - position of T) in its
+The second is for sensors whose bearings are so poor that the density is an arc and no ellipse: [S] 2.3.5.  The
+third is for sensors that measure no depth.  Such a sensor observes v = rho (point - position of T) in its
 frame: the ray to the point, regular for points at infinity, rho = 0, too.
 """
 

@@ -9,9 +9,9 @@ anchored             anchor (3), m (3), rho                anchor + m / rho
 homogeneous          h (3), rho                            h / rho
 ===================  ====================================  ====================
 
-The last three are for sensors that see no depth.  What such a sensor sees of them is v = rho (point - position of T) in
+The last three are for sensors that measure no depth.  Such a sensor observes v = rho (point - position of T) in
 its frame: the ray to the point, regular for points at infinity, rho = 0, too.  `..._from_view` takes a ray of any
-length and an inverse distance rho, the prior of what the ray lacks.  A sensor that measures ranges wants the Euclidean
+length and an inverse distance rho, the prior of the distance.  A sensor that measures ranges requires the Euclidean
 point, `..._to_point`.  The anchored point is called homogeneous as well; its m is a unit vector when it is made,
 free later.
 """

@@ -10,7 +10,7 @@ anchored_homogeneous_line  anchor (3), (m (3), rho) x 2               through tw
 homogeneous_line           (h (3), rho) x 2                           through two homogeneous points
 =========================  =========================================  ==================================
 
-What a camera sees of a line is v: the normal, in its frame, of the plane through the optical centre and the line.  The
+A camera observes v of a line: the normal, in its frame, of the plane through the optical centre and the line.  The
 length of v has no meaning; a line through the optical centre has v = 0, and no image.  `..._from_view` takes the
 viewing rays (K, 6) of two points of the line, of any length, and a prior of what they lack: of each end the inverse
 distance rho (K, 2), or of Pluecker lines beta (K, 2), the direction of the line in a basis of that plane, as long as
@@ -38,7 +38,7 @@ from kalmark.models.landmarks3d import anchored_seen_from, chained, homogeneous_
 
 PLUECKER_ABSCISSAS_M = (-8.0, 8.0)  # of a new line.  [TB]
 POINT_ABSCISSAS = (0.0, 1.0)
-NEAREST_M = 1e-3  # a camera sees nothing nearer
+NEAREST_M = 1e-3  # a camera observes nothing nearer
 
 View = tuple[Array, Array, Array]
 New = tuple[Array, Array, Array, Array]

@@ -50,7 +50,7 @@ class CheckResult:
 
 
 def check_model(model: Any, rng: Rng) -> list[CheckResult]:
-    """Return one finding for each promise of a motion, sensor or landmark model, or of a function.
+    """Return one finding for each requirement on a motion, sensor or landmark model, or of a function.
 
     A function f(x, ...) returns a value and its Jacobians in its arguments, in their order.  Raises ModelError if it is
     none of these, or returns the wrong shapes.
@@ -171,7 +171,7 @@ def _inverse(
 ) -> None:  # fmt: skip
     """Check what a sensor starts landmarks from: a view, a ray or the two rays of a line.
 
-    Of a sensor that sees its velocity, that is the first half of the views `moving` (K, 2 d).
+    Of a sensor that measures its velocity, that is the first half of the views `moving` (K, 2 d).
     """
     sized = model.columns[-1] == "size_m"  # a tag, found by iterations; its size has no error,
     exact = sized + sum(name in ("right_m", "left_m") for name in model.columns)  # nor have the ends of a wall

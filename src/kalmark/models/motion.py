@@ -4,10 +4,10 @@ Wheels of other kinds are in `wheels`, velocities in the state of a robot of the
 `inertial`, what all share in `kinematics`; all have their names here.
 
 Three kinds of noise.  The *control's error* (`sigma_v_mps`, ...) is constant as long as the control is held, so its
-displacement is sigma times the duration.  What *all controls lack*, a constant or a share of them (`sigma_v_bias_mps`,
-`sigma_scale`, ...), is in the map and estimated.  A *diffusion* (`..._per_sqrt_s`) is white: its variance grows with
-time; in the plane along, across and about the robot, while the control is not zero (a robot told to stand does not
-wander).
+displacement is sigma times the duration.  The *error common to all controls*, a constant or a share of them
+(`sigma_v_bias_mps`, `sigma_scale`, ...), is in the map and estimated.  A *diffusion* (`..._per_sqrt_s`) is white: its
+variance grows with time; in the plane along, across and about the robot, while the control is not zero (a robot with
+zero control does not wander).
 """
 
 from __future__ import annotations

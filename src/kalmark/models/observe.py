@@ -1,11 +1,11 @@
-"""The seam: where a sensor on a robot and a landmark of the map meet, the chain rule written out.  [S] A.5, (63), (64).
+"""Observation models: composition of a sensor on a robot and a landmark, by the chain rule.  [S] A.5, (63), (64).
 
-`expectation` is the readable form and serves any models.  `linearize` is how the filter's kernels ask for it: plain
+`expectation` is the readable form and serves any models.  The filter's kernels call `linearize`: plain
 Python for a model written in Python, the compiled twin below for the built-in ones.  Both are tested to be equal.
 The head is the robot's pose or, for a mount in the map, the pose and the mount, and behind it the parameters that the
 sensor has in the map, gain and offset of its range.  Sensors of the robot itself have their own: `state_view.py`.
 
-Motions have their seam at the end: a built-in one is compiled and called by its address, a user's is run in Python.
+Motions are at the end: a built-in one is compiled and called by its address, a user's is run in Python.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: A
 def inverse_expectation(r: Array, mount: Array, sensor: FullSensor, landmark: Landmark, y: Array) -> tuple[Array, ...]:
     """Return the landmarks l (K, n) that explain y (K, m), with L_r, L_s, L_y and their prior.  [S] (64), (31)-(34).
 
-    The prior (K, n, n) is the covariance of what y does not tell.
+    The prior (K, n, n) is the covariance of the components that y does not determine.
     """
     return landmark_at(r, mount, landmark, *sensor.invert(y), finds_depth(sensor))
 
@@ -374,7 +374,7 @@ class Compiled:
 
 
 class CompiledVelocity(Compiled):
-    """A compiled motion of which the state tells how fast the robot moves: a `HasVelocity`."""
+    """A compiled motion whose state contains the velocity of the robot: a `HasVelocity`."""
 
     velocity: ClassVar[Any]
 

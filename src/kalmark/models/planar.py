@@ -87,11 +87,11 @@ def by_gain_and_offset(code: int, par: Array, angular: Flags, v: Array, e: Array
 
 @declared
 class _Planar(Expecting):
-    """What the planar sensors share: limits of sight, built-in expectation."""
+    """Base of the planar sensors: limits of range, built-in expectation."""
 
     _: KW_ONLY
-    range_min_m: Annotated[NotNegative, "Nearest landmark the sensor sees."] = 0.0
-    range_max_m: Annotated[Limit, "Farthest landmark the sensor sees."] = math.inf
+    range_min_m: Annotated[NotNegative, "Nearest landmark that is measured."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
     fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
 
     world: ClassVar[str] = "plane"

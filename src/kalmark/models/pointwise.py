@@ -102,7 +102,7 @@ def pointwise(
     """Make a sensor of `measure(v) -> y` (m,), v = (x, y[, ...]) in the sensor's frame, noise covariance `noise`.
 
     `inverse(y) -> v` lets it start landmarks.  `jacobian(v)` (m, d) and `inverse_jacobian(y)` (d, m) are numerical when
-    not given.  `angular` says which components are angles.  With `noise_inside` the sensor is `measure(v, n)` and
+    not given.  `angular` marks the components that are angles.  With `noise_inside` the sensor is `measure(v, n)` and
     `noise` the covariance of n.
     """
     R = np.atleast_2d(np.asarray(noise, dtype=np.float64))

@@ -1,7 +1,7 @@
 """The protocols of a motion, a sensor and a landmark, and their optional capabilities.
 
-N + M, not N x M: a sensor knows a point in its own frame only.  Models are batched: K landmarks at once, values (K, d),
-Jacobians (K, m, d).  `pointwise` lifts one-point functions.
+N + M, not N x M: a sensor measures a point in its own frame only.  Models are batched: K landmarks at once, values (K,
+d), Jacobians (K, m, d).  `pointwise` lifts one-point functions.
 
 A capability is optional.  One with a default is read by the function of its name, as in `finds_depth(sensor)`; one that
 decides what is done with a model is a Protocol, as in `isinstance(sensor, Visible)`.
@@ -22,7 +22,7 @@ from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
 
 @runtime_checkable
 class Motion(Protocol):
-    """How a robot moves.  [S] (1), (14)-(17)."""
+    """The motion of a robot.  [S] (1), (14)-(17)."""
 
     @property
     def space(self) -> Space:
@@ -51,7 +51,7 @@ class Motion(Protocol):
 
 @runtime_checkable
 class Sensor(Protocol):
-    """What a sensor measures of something at v in its own frame.  [S] (2), (18)."""
+    """The measurement of a landmark at v in the frame of the sensor.  [S] (2), (18)."""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -78,15 +78,15 @@ class FullSensor(Sensor, Protocol):
 
 @runtime_checkable
 class NonAdditiveSensor(Sensor, Protocol):
-    """A sensor whose noise depends on what it looks at, or enters inside the measurement, y = g(v, n)  [F].
+    """A sensor whose noise depends on the landmark, or enters inside the measurement, y = g(v, n)  [F].
 
-    The measured values must not weigh themselves: a range noise that grows with the range, taken at the measured range,
-    trusts the short ones more and pulls every landmark nearer.
+    The noise must not be taken at the measured values: of a range noise that grows with the range, this weights the
+    short ranges more and biases every landmark towards the sensor.
     """
 
     @property
     def additive(self) -> bool:
-        """Return True if `noise` says it all."""
+        """Return True if `noise` is the complete noise."""
 
     def noise_at(self, v: Array) -> Array:
         """Return E_n N E_n' (K, m, m) at v (K, d)."""
@@ -94,7 +94,7 @@ class NonAdditiveSensor(Sensor, Protocol):
 
 @runtime_checkable
 class Landmark(Protocol):
-    """How a landmark looks from a pose: v, the landmark in the frame T of the sensor."""
+    """The view of a landmark from a pose: v, the landmark in the frame T of the sensor."""
 
     @property
     def kind(self) -> str:
@@ -191,12 +191,12 @@ class _StateColumns(Protocol):
 
 @runtime_checkable
 class HasVelocity(Protocol):
-    """A motion of which the state tells how fast the robot moves."""
+    """A motion whose state contains the velocity of the robot."""
 
     def body_velocity(self, r: Array) -> tuple[Array, Array]:
         """Return the velocity of a state r (size,) in the robot's frame, and its Jacobian (3 or 6, dof).
 
-        In the plane (vx, vy, w), in space (v (3), w (3)), m/s and rad/s; NaN where the state does not tell.
+        In the plane (vx, vy, w), in space (v (3), w (3)), m/s and rad/s; NaN where the state does not contain it.
         """
 
 
@@ -327,7 +327,7 @@ def innovation_size(sensor: Sensor) -> int:
 # ------------------------------------------------------------------ capabilities of sensors
 @runtime_checkable
 class Visible(Protocol):
-    """A sensor with limits of sight."""
+    """A sensor with a limited field of view."""
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d), in the sensor's frame, can be measured."""
@@ -335,7 +335,7 @@ class Visible(Protocol):
 
 @runtime_checkable
 class SegmentVisible(Protocol):
-    """A sensor that sees parts of line segments."""
+    """A sensor that measures parts of line segments."""
 
     def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
         """Return which segments from p1 to p2 (K, 2 or 3) of the world are seen from T, and what is measured."""
@@ -415,14 +415,14 @@ class Drifting(Protocol):
 
 @runtime_checkable
 class Distant(Protocol):
-    """A sensor whose first component tells the distance."""
+    """A sensor whose measurements determine the distance."""
 
     def distances(self, y: Array) -> Array:
         """Return the distances (K,) in m that measurements y (K, m) stand for."""
 
 
 def distances_alone(sensor: Sensor) -> bool:
-    """Return whether a sensor measures one number alone that tells the distance in the plane: a range, a strength."""
+    """Return whether a sensor measures one number alone that determines a distance in the plane: range, strength."""
     return len(sensor.columns) == 1 and isinstance(sensor, Distant) and world_of(sensor) != "space"
 
 

@@ -20,7 +20,7 @@ from kalmark.models.landmark_views import Distancing, Raised, raised
 
 __all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
 
-NEAREST_M = 1e-3  # nearer than this a receiver and what it hears are at one place
+NEAREST_M = 1e-3  # nearer than this a receiver and a transmitter are at one place
 DECIBELS = 10.0 / math.log(10.0)  # in one unit of a natural logarithm of power
 
 
@@ -68,10 +68,10 @@ def difference(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tup
 
 @declared
 class _Receiver(Distancing):
-    """What both share: a point of either world, and a largest distance."""
+    """Base of both: a point of either world, and a largest distance."""
 
     _: KW_ONLY
-    range_max_m: Annotated[Limit, "Farthest landmark that is heard."] = math.inf
+    range_max_m: Annotated[Limit, "Farthest landmark that is received."] = math.inf
 
     additive: ClassVar[bool] = True
 

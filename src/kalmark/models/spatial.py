@@ -30,8 +30,8 @@ class Wall(Spatial):
     sigma_distance_m: Annotated[Positive, "Noise of the distance of the line."] = 0.02
     sigma_normal_rad: Annotated[Positive, "Noise of the direction of its normal."] = 0.01
     _: KW_ONLY
-    range_min_m: Annotated[NotNegative, "Nearest part of a wall the sensor sees."] = 0.0
-    range_max_m: Annotated[Limit, "Farthest part of a wall the sensor sees."] = math.inf
+    range_min_m: Annotated[NotNegative, "Nearest part of a wall that is measured."] = 0.0
+    range_max_m: Annotated[Limit, "Farthest part of a wall that is measured."] = math.inf
     fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
     min_length_m: Annotated[NotNegative, "Shortest segment that counts as seen."] = 0.5
 

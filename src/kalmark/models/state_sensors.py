@@ -1,6 +1,6 @@
 """Sensors that measure their own robot: its pose, its velocity, or how it moved since their last reading.
 
-Each makes one reading at a time.  What it sees is a `view` of the state (`models/state_view.py`).  A reading outside
+Each makes one reading at a time.  It measures a `view` of the state (`models/state_view.py`).  A reading outside
 the gate that `pass_share` of good readings pass is left out.  Constants of a sensor with a sigma, or with a random
 walk, are in the map and are estimated (docs/state_sensors.md).
 """
@@ -203,7 +203,7 @@ Walk = Annotated[NotNegative, "Random walk of the bias; above 0 it is in the map
 
 @declared
 class StateSensor(Sensing):
-    """What all sensors of the state share.
+    """Base of all sensors of the state.
 
     `constants` are, for each number that `expected` takes, the parameter, that of its sigma, and that of its walk.
     """
@@ -414,7 +414,7 @@ class Inclination(StateSensor):
 class Gravity(StateSensor):
     """An accelerometer where its robot does not accelerate: it measures g, upwards, in its own frame."""
 
-    sigma_mps2: Annotated[Positive, "Noise of each component, accelerations that are not told included."] = 0.2
+    sigma_mps2: Annotated[Positive, "Noise of each component, unmodelled accelerations included."] = 0.2
     _: KW_ONLY
     gravity_mps2: Annotated[Positive, "Acceleration of gravity."] = STANDARD_GRAVITY
     bias_x_mps2: Bias = 0.0
@@ -557,7 +557,7 @@ class Speed(_Velocity):
 
 @register("sensor", "ground_speed")
 class GroundSpeed(StateSensor):
-    """The speed, whatever its direction: as GPS receivers tell it."""
+    """The speed in any direction, as GPS receivers measure it."""
 
     sigma_mps: Annotated[Positive, "Noise of the speed."] = 0.1
 
@@ -569,7 +569,7 @@ class GroundSpeed(StateSensor):
 
 @declared
 class _ZeroVelocity(StateSensor):
-    window_s: Annotated[Positive, "Time over which a robot must stand to be noticed."] = 1.0
+    window_s: Annotated[Positive, "Time over which a robot must stand to be detected."] = 1.0
     _: KW_ONLY
     slowest_mps: Annotated[Positive, "The slowest motion that is not to be taken for standing."] = 0.05
     slowest_radps: Annotated[Positive, "The slowest turn that is not to be taken for standing."] = 0.05
@@ -584,9 +584,9 @@ class _ZeroVelocity(StateSensor):
 
 @register("sensor", "zero_velocity")
 class ZeroVelocity2D(_ZeroVelocity):
-    """No sensor but what is noticed of the others: that the robot stands, which is a reading of zero velocity.
+    """Readings of zero velocity, made where the other sensors show that the robot stands.
 
-    It has no rows in a log; rows that it has are readings, of a brake for example.  docs/state_sensors.md.
+    No rows in the log are needed; rows that there are, of a brake for example, are readings.  docs/state_sensors.md.
     """
 
     world: ClassVar[str] = "plane"
@@ -596,9 +596,9 @@ class ZeroVelocity2D(_ZeroVelocity):
 
 @register("sensor", "zero_velocity")
 class ZeroVelocity3D(_ZeroVelocity):
-    """No sensor but what is noticed of the others: that the robot stands, which is a reading of zero velocity.
+    """Readings of zero velocity, made where the other sensors show that the robot stands.
 
-    It has no rows in a log; rows that it has are readings, of a brake for example.  docs/state_sensors.md.
+    No rows in the log are needed; rows that there are, of a brake for example, are readings.  docs/state_sensors.md.
     """
 
     world: ClassVar[str] = "space"
@@ -615,7 +615,7 @@ class _Odometer(_Scaled):
     keep: Annotated[
         int,
         Within(ge=0),
-        "Poses of its last scans that are kept: an `id`, the time of one, tells what it counts from; 0: of a whole log "
+        "Poses of its last scans that are kept: an `id`, the time of one, names the reference; 0: of a whole log "
         "those that later readings count from.",
     ] = 1
 
@@ -625,7 +625,7 @@ class _Odometer(_Scaled):
 
 @register("sensor", "odometer")
 class Odometer2D(_Odometer):
-    """How the sensor moved since its last reading, in the frame where it was then: a second odometry, scan matching."""
+    """The motion of the sensor since its last reading, in its frame at that time: a second odometry, scan matching."""
 
     world: ClassVar[str] = "plane"
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
@@ -634,7 +634,7 @@ class Odometer2D(_Odometer):
 
 @register("sensor", "odometer")
 class Odometer3D(_Odometer):
-    """How the sensor moved since its last reading, in the frame where it was then; its turn is a rotation vector."""
+    """The motion of the sensor since its last reading, in its frame at that time; its turn is a rotation vector."""
 
     world: ClassVar[str] = "space"
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")

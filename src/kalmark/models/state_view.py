@@ -1,6 +1,7 @@
-"""The seam of sensors that measure their own robot: what they see of its state, the chain rule written out.
+"""Views of sensors that measure their own robot: functions of its state, the chain rule written out.
 
-A sensor of landmarks sees v, a landmark in its frame (`models/observe.py`).  A sensor of the state sees one of these:
+A sensor of landmarks observes v, a landmark in its frame (`models/observe.py`).  A sensor of the state observes one of
+these:
 
 ======  =========================================================  ===================  =======================
 view    v                                                          second block l       numbers in plane, space
@@ -162,8 +163,8 @@ def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
 
     Like `observe.linearize`: the head is the robot's pose and, if in the map, the mount and the sensor's parameters.
     y (1, m + 1) ends with the time since the last reading, and may have the control in force behind it where the
-    velocity is of the state.  Else in y (1, 2 m + 1) the reading as earlier ones tell it comes before the time: the
-    parameters' Jacobian is taken of it (docs/motions.md).
+    velocity is of the state.  Else in y (1, 2 m + 1) the mean of earlier readings comes before the time: the
+    parameters' Jacobian is taken there (docs/motions.md).
     """
     _, chain_at, expect_at, velocity, at, par, angular, vary_at = view
     pose, m = len(at), len(angular)
@@ -242,13 +243,13 @@ def state_view_of(sensor: OfState, motion: Any, mount: Array) -> Any:
 
 
 def sees_state(sensor: OfState, motion: Any) -> bool:
-    """Return whether a sensor sees a twist that is in the robot's state: of some motions the velocity alone is."""
+    """Return whether a sensor measures a twist that is in the robot's state: of some motions the velocity alone is."""
     held = isinstance(motion, HoldsRate) and not sees_rates(sensor)
     return sensor.views == TWIST and (held or isinstance(motion, HasVelocity))
 
 
 def view_of_state(sensor: OfState, motion: Any, mount: Array, state: Array, before: Array, since: Array) -> Array:
-    """Return what a sensor sees of a robot in a `state`, whose pose was `before` at the last reading.
+    """Return the view v of a robot in a `state`, whose pose was `before` at the last reading.
 
     `since` (1 + k,): the seconds since then, and the control in force.
     """

@@ -1,8 +1,8 @@
 """Square tags, landmarks of six degrees of freedom: l = (x, y, z, qx, qy, qz, qw), the tag's frame in the map.
 
 The tag lies in the plane z = 0 of its frame, with its corners at (-s, -s), (s, -s), (s, s), (-s, s), s half its size.
-What a sensor sees of it is v, the tag's frame in its own; errors of l are those of frames in the map, errors of v
-(position, rotation vector) are in the sensor's frame.  A camera sees the four corners, y = (u1, v1, ..., u4, v4).
+A sensor observes v, the tag's frame in its own; errors of l are those of frames in the map, errors of v
+(position, rotation vector) are in the sensor's frame.  A camera measures the four corners, y = (u1, v1, ..., u4, v4).
 """
 
 from __future__ import annotations
@@ -89,14 +89,14 @@ def pose_residual(y: Array, v: Array) -> tuple[Array, Array]:
 
 @compiled
 def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array) -> tuple[Array, Array, Array]:
-    """Find the two tags whose corners look like y (K, 8): v (K, 2, 7), V_y (K, 2, 6, 8), sums of squares (K, 2) px^2.
+    """Find the two tags whose corners fit y (K, 8): v (K, 2, 7), V_y (K, 2, 6, 8), sums of squares (K, 2) px^2.
 
-    `rays` (K, 4, 3) are the corners' viewing rays.  From afar a tag looks the same when it is mirrored along the line
-    of sight, so that the sum of squared pixels has two minima: both are sought, by Levenberg's method from the
-    homography of the corners and from its mirror image, and the lower one comes first.  Where noise has left but one,
-    the second is its mirror image, without V_y; its sum is infinite where that is within `FACING`, for then it does not
-    matter.  All is NaN where the four pixels are no convex quadrangle of rays ahead.  V_y = (E'E)^-1 E' of Gauss-
-    Newton, so that V_y N V_y' is the covariance for noise N of the pixels.
+    `rays` (K, 4, 3) are the corners' viewing rays.  From afar the corners are nearly the same when the tag is mirrored
+    along the line of sight, so that the sum of squared pixels has two minima: both are sought, by Levenberg's method
+    from the homography of the corners and from its mirror image, and the lower one comes first.  Where noise has left
+    but one, the second is its mirror image, without V_y; its sum is infinite where that is within `FACING`, for then it
+    does not matter.  All is NaN where the four pixels are no convex quadrangle of rays ahead.  V_y = (E'E)^-1 E' of
+    Gauss- Newton, so that V_y N V_y' is the covariance for noise N of the pixels.
     """
     k = len(y)
     v, V_y, cost = np.full((k, 2, 7), np.nan), np.full((k, 2, 6, 8), np.nan), np.full((k, 2), np.nan)
@@ -143,7 +143,7 @@ def refined(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple
             v, e, E_v, cost, damping = new, e_new, E_new, cost_new, 0.1 * damping
         else:
             damping = max(10.0 * damping, 1e-9)
-        if change < (1e-13 if lower else 1e-7) or damping > 1e9:  # below 1e-7 the cost cannot tell any more
+        if change < (1e-13 if lower else 1e-7) or damping > 1e9:  # below 1e-7 the cost has no digits left
             break
     return v[0], E_v[0], cost if math.isfinite(cost) else np.nan
 

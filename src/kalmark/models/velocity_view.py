@@ -1,6 +1,6 @@
 """The seam of sensors that see, besides a landmark, how fast they move themselves: the chain rule written out.
 
-What is seen is v = (p, t): the landmark in the sensor's frame, as in `models/observe.py`, and the velocity of the
+The view is v = (p, t): the landmark in the sensor's frame, as in `models/observe.py`, and the velocity of the
 sensor in its own frame, the first part of the twist of `models/state_view.py`.  It depends on three blocks: on the
 robot's pose, on the landmark, and on the state that has the velocity or, where the motion has none, on a clone of the
 pose at the sensor's last scan: then the velocity is the mean since.  This is the second block of the head, where
@@ -71,7 +71,7 @@ def placed(r: Array, at: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class PythonMovingView:
-    """A sensor that sees landmarks and its velocity, evaluated in Python: for a user's sensor, landmark or motion."""
+    """A sensor of landmarks and its velocity, evaluated in Python: for a user's sensor, landmark or motion."""
 
     sensor: Sensor
     landmark: Landmark
@@ -113,7 +113,7 @@ def velocity_of(motion: Any, at: Array, r: Array, x: Array, since: Array) -> tup
 
 
 def moving_view_of(sensor: Any, landmark: Any, motion: Any, at: Array, since: Array) -> Any:
-    """Return the argument of `linearize` for a sensor on a mount (3,) or (7,) that sees landmarks and its velocity.
+    """Return the argument of `linearize` for a sensor on a mount (3,) or (7,) that measures landmarks and its velocity.
 
     `since` (1 + k,) is read at each scan: the seconds since the last one, which count where the motion has no velocity
     in its state, and the control in force where that has the turn rate.

@@ -6,9 +6,9 @@ point, and a rotation turns the anchor and alpha.  So the atoms of points and he
 the line from the origin, rho = n . a, a translation t would add n . t, which depends on the estimate (docs/walls.md).
 The anchor is in the middle of the first observed segment.
 
-A point of the line is told by its abscissa t, p = a + t tau, tau = (-sin alpha, cos alpha).  A sensor sees the line as
-v: its distance along n, negative if n points to the sensor, and the direction of n in the sensor's frame.  (v1, v2) and
-(-v1, v2 + pi) are the same line.
+A point of the line is given by its abscissa t, p = a + t tau, tau = (-sin alpha, cos alpha).  A sensor observes
+v: the distance of the line along n, negative if n points to the sensor, and the direction of n in the sensor's frame.
+(v1, v2) and (-v1, v2 + pi) are the same line.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def wall(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Arr
 
 
 def facing(y: Array) -> Array:
-    """Return segments y (K, 4) with distances of at least 0: the same lines, told from the other side."""
+    """Return segments y (K, 4) with distances of at least 0: the same lines, with the opposite normals."""
     other = np.column_stack([-y[:, 0], wrap(y[:, 1] + math.pi), -y[:, 3], -y[:, 2]])
     return np.asarray(np.where(y[:, :1] < 0.0, other, y))
 

@@ -45,7 +45,7 @@ scalars = lru_cache(maxsize=64)(Rn)
 class CompressedMap(Layout):
     """The joint Gaussian of all blocks, of which a few are active and the others inactive.
 
-    A block keeps its slot.  `index` and `predict` speak of rows of the active map: an index holds until the next
+    A block keeps its slot.  `index` and `predict` take rows of the active map: an index is valid until the next
     correction.  `most` limits the rows of the active map, auxiliary states included; by default a compression interval
     ends when its corrections have cost more than its full update.
     """
@@ -163,7 +163,7 @@ class CompressedMap(Layout):
         return Pairs.of(slots, places, read, p, nearest, farther)
 
     def nearest(self, model: Any, scan: Seen, asked: Asked) -> Nearest | None:
-        """Return the wanted block that each observation can only be of; None where that takes more to tell.
+        """Return the only wanted block that each observation can be of; None where more is needed to decide that.
 
         Only active blocks are read: it is not clear where an inactive one may be nearer.
         """

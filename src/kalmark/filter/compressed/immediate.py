@@ -159,7 +159,7 @@ class ImmediateCorrections:
 
 
 class Displacements(NamedTuple):
-    """What displaced inactive blocks, and how each immediate correction among that turned the world.
+    """Displacements of inactive blocks, and the turn of the world by each immediate correction among them.
 
     All as `ImmediateCorrections` has it, and the axes of the turns.
     """

@@ -104,7 +104,7 @@ def none_nearer(
 class Region(NamedTuple):
     """All blocks within a radius of a centre, and where they were when the interval began.
 
-    `spread` are the sigmas of what they were off by then relative to one block, or -1 until they are asked for.
+    `spread` are the sigmas of what they were off by then relative to one block, or -1 until they are needed.
     """
 
     centre: Array
@@ -115,7 +115,7 @@ class Region(NamedTuple):
 
 
 class InactiveSearch:
-    """A tree of the blocks of one compression interval, made when it is first asked."""
+    """A tree of the blocks of one compression interval, made when it is first needed."""
 
     def __init__(self) -> None:
         self._tree: Any = None

@@ -1,7 +1,7 @@
 """The numerical rank of what a full update subtracts: far from the active blocks it is small.  docs/compressed.md.
 
 Of P_BB - W W' any rotation of the columns of W is free.  Here it is one after which the rows of most blocks are nearly
-zero from some column on; a tile of the product needs only the columns before that.  What is left out of an element is
+zero from some column on; a tile of the product needs only the columns before that.  The omitted part of an element is
 at most `EXACT` times the sigmas of its row and its column.
 """
 
