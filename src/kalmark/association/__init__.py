@@ -1,6 +1,6 @@
 """Data association: the landmark of each observation, by the log's ids, by nearest neighbours, together, or jointly.
 
-What an association may ask and answer is in `protocol`; a user's own one needs no more than `Association` says.
+The queries and decisions of an association are in `protocol`; a user's own one requires `Association` only.
 """
 
 from __future__ import annotations

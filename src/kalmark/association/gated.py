@@ -139,8 +139,8 @@ class GlobalAssignment(Gated):
 class JointCompatibility(Gated):
     """The largest set of pairs that fit together (JCBB): for a pose known worse than landmarks are apart.
 
-    Neira and Tardos 2001.  The error of the pose is common to all observations of a scan, and only a joint test knows.
-    At most `most_nodes` of the search are looked at; what is best by then is taken.
+    Neira and Tardos 2001.  The error of the pose is common to all observations of a scan, which only a joint test
+    considers.  At most `most_nodes` of the search are examined; the best matching by then is taken.
     """
 
     most_nodes: Annotated[Count, "Nodes of the search after which the best so far is taken."] = 20_000
@@ -167,7 +167,7 @@ class JointCompatibility(Gated):
 
 @register("association", "identity")
 class ByIdentity:
-    """Trust the ids of the log.
+    """Associate by the ids of the log.
 
     An id that is not in the map yet is a new landmark.
 
@@ -186,5 +186,5 @@ class ByIdentity:
         return math.inf if self.gate == "off" else chi2_gate(float(self.gate), m)
 
     def associate(self, query: Query) -> list[Decision]:
-        """Answer with the ids as they are; the slam knows which are new."""
+        """Return the ids as they are; `Slam` decides which are new."""
         return [(i, "") if i is not None else (None, "no id in the log") for i in query.ids]

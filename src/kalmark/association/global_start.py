@@ -53,7 +53,7 @@ class GlobalPose(NamedTuple):
 
     @property
     def pairs(self) -> int:
-        """How many observations are of landmarks."""
+        """Number of observations of landmarks."""
         return int((self.matched >= 0).sum())
 
 

@@ -40,13 +40,13 @@ def agree(i: int, a: int, j: int, b: int, places: Places, gate: float) -> bool:
 @compiled
 def narrow(alive: Flags, m: int, of: Index, landmark: Index, places: Places, gate: float, left: Flags) -> int:
     """Write into `left` (M,) which of the pairs `alive` (M,) agree with pair m; return the number of tests."""
-    asked = 0
+    tests = 0
     for c in range(len(alive)):
         left[c] = False
         if alive[c] and of[c] != of[m] and landmark[c] != landmark[m]:
-            asked += 1
+            tests += 1
             left[c] = agree(of[c], landmark[c], of[m], landmark[m], places, gate)
-    return asked
+    return tests
 
 
 @compiled
@@ -76,8 +76,8 @@ def matchings(  # noqa: C901 - one compiled loop: a recursion without calls
     alive[0] = True
     found, sizes, n = np.full((keep, k), -1), np.zeros(keep, np.int64), 0
     taken, at = np.full(k, -1), first[:-1].copy()
-    i = count = asked = best = 0
-    while i >= 0 and asked < most:
+    i = count = tests = best = 0
+    while i >= 0 and tests < most:
         if i < k and taken[i] >= 0:  # back from below: this pair has been tried
             taken[i], count = -1, count - 1
         if i == k or at[i] > first[i + 1]:  # a leaf, or all has been tried
@@ -99,7 +99,7 @@ def matchings(  # noqa: C901 - one compiled loop: a recursion without calls
         if not skip:
             if not alive[count, m]:
                 continue
-            asked += narrow(alive[count], m, of, landmark, places, gate, alive[count + 1])
+            tests += narrow(alive[count], m, of, landmark, places, gate, alive[count + 1])
         if count + (not skip) + possible(alive[count + (not skip)], first, i + 1) < best - slack:
             continue
         if not skip:

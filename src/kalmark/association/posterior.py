@@ -4,7 +4,7 @@ A matching of c pairs has the likelihood N(v; 0, Z) of its joint innovation, lin
 times the density of what is not in the map for each observation that it leaves without a pair: that of the landmarks
 near it (`geometry/density.py`).  What shares of a scan are of landmarks just seen, of others of the map, and of none
 have a prior Dirichlet(1/2 + a, 1/2, 1/2): Jeffreys', rather all or nothing, and the `experience` of a observations that
-lately were of landmarks just seen.  These say nothing about a return to older ones.
+lately were of landmarks just seen.  The prior of older ones does not depend on these.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from kalmark.association.matchings import matchings
 from kalmark.association.query import Candidates
 from kalmark.geometry.gaussian import gate as chi2_gate
 
-WELL_KNOWN = math.log(16.0)  # |Z| / |R| up to which the robot knows where a landmark is
+WELL_KNOWN = math.log(16.0)  # |Z| / |R| up to which the relative position of a landmark is well known
 SLACK = 1  # pairs that a matching may have less than the largest
-KEEP = 200  # matchings to look at
+KEEP = 200  # matchings that are kept
 
 
 class Posterior(NamedTuple):
@@ -30,7 +30,7 @@ class Posterior(NamedTuple):
 
     The likeliest comes first.  `chance` bounds how many matchings as good as that one are expected among things that
     stand anywhere; `elsewhere` is how many there are that have at most a pair less and are of another pose: in rows of
-    landmarks, these tell what chance does.  `finished` tells whether the search was.
+    landmarks, these show how many are expected by chance.  `finished`: whether the search was.
     """
 
     pairs: Index
@@ -55,8 +55,8 @@ class Posterior(NamedTuple):
         """Return what an observation may be, for a reason."""
         shares = {c: float(self.weights[self.pairs[:, row] == c].sum()) for c in self.pairs[:, row].tolist()}
         likely = sorted(shares.items(), key=lambda one: -one[1])[:3]
-        said = ", ".join(f"{'none' if c < 0 else repr(names[c])} {share:.2f}" for c, share in likely)
-        return f"ambiguous: {said}" + ("" if self.finished else ", and the search was not finished")
+        shown = ", ".join(f"{'none' if c < 0 else repr(names[c])} {share:.2f}" for c, share in likely)
+        return f"ambiguous: {shown}" + ("" if self.finished else ", and the search was not finished")
 
 
 def expected_in_gate(d2: Array, gate: float, p: int) -> Array:

@@ -16,7 +16,7 @@ from kalmark.events import Id
 
 
 class Answer(Enum):
-    """What an association may answer instead of a landmark; the values stand in the place of a pair's number.
+    """Decisions of an association other than a landmark; the values stand in the place of a pair's number.
 
     NONE: leave the observation alone.  DEFERRED: it cannot be decided yet.  NEW: it is not in the map.  MIXTURE: it is
     averaged over several landmarks.  REMAP: the robot is lost; what it observes may be mapped again until it
@@ -84,7 +84,7 @@ class _GatesNew(Protocol):
 
 
 def weighs(association: Association) -> bool:
-    """Return whether an association weighs whole matchings, and so says itself what is ambiguous; by default not."""
+    """Return whether an association weighs whole matchings, and so decides itself what is ambiguous; by default not."""
     return isinstance(association, _Weighs) and association.weighs
 
 

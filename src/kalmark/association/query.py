@@ -31,7 +31,7 @@ def log_volume_ratio(Z: Array, R: Array) -> Array:
 
 
 class Query:
-    """One scan before it is fused: what an association may ask about it.
+    """One scan before it is fused: the queries of an association about it.
 
     `learned` is the number of observations without ids that are likely of landmarks just seen.
     """
@@ -39,7 +39,7 @@ class Query:
     def __init__(self, scan: ScanContext) -> None:
         self.scan, self.ids, self.y = scan, scan.ids, scan.y
         self.learned = 0.0
-        self._pairs: Pairs | None = None  # near each other when candidates were asked for,
+        self._pairs: Pairs | None = None  # near each other, of the last query for candidates,
         self._names: list[Id] = []  # and the landmarks of these
         self._known = scan.tracks.known  # exactly, and outside the map
 
@@ -52,7 +52,7 @@ class Query:
         return self.scan.tracks.experience
 
     def learn(self, again: float) -> None:
-        """Say how many observations without ids are likely of landmarks just seen."""
+        """Set the number of observations without ids that are likely of landmarks just seen."""
         self.learned = float(again)
 
     def key(self) -> tuple[int, ...]:
@@ -85,9 +85,9 @@ class Query:
         return self._names.copy()
 
     def nearest(self, nearest: int, farther: float, gate: float) -> list[Id] | None:
-        """Return the landmark that each observation can only be of: the nearest inside the gate on d2, of no other one.
+        """Return the only landmark that each observation can be of: the nearest inside the gate on d2, of no other one.
 
-        None of a scan in which that is not so of all, that has ids, or where it takes the other questions to tell.
+        None of a scan in which that is not so of all, that has ids, or where the other queries are needed.
         """
         scan, channel, tracks = self.scan, self.scan.channel, self.scan.tracks
         model = tracks.only_model(channel)
@@ -138,8 +138,8 @@ class Query:
         if candidates != self._names:
             at = {name: i for i, name in enumerate(candidates)}
             columns = np.array([at.get(name, -1) for name in self._names], dtype=np.int64)[columns]
-            asked = columns >= 0
-            columns, pairs = columns[asked], pairs._replace(rows=pairs.rows[asked], numbers=pairs.numbers[asked])
+            kept = columns >= 0
+            columns, pairs = columns[kept], pairs._replace(rows=pairs.rows[kept], numbers=pairs.numbers[kept])
         d2[pairs.rows, columns] = squared = self._squared(pairs, self._names)
         self.scan.report.compared = Compared(pairs.rows, pairs.numbers, self._names, squared, pairs.places)
         return d2
@@ -191,7 +191,7 @@ class Query:
         return z, Z
 
     def together(self, names: list[Id]) -> Candidates | None:
-        """Return landmarks to be asked about jointly; None if of several kinds, or if this sensor gives no places."""
+        """Return candidates for joint queries; None if of several kinds, or if this sensor gives no places."""
         scan = self.scan
         if not scan.channel.gives_places or len(sorts := {scan.tracks.sort(name) for name in names}) > 1:
             return None
@@ -204,7 +204,7 @@ class Query:
 
 
 class Candidates:
-    """Landmarks of one kind that a scan may show, asked about jointly; `read` is a joint marginal that has them."""
+    """Landmarks of one kind that a scan may show, for joint queries; `read` is a joint marginal that has them."""
 
     def __init__(self, scan: ScanContext, model: ObservationModel, read: Marginal) -> None:
         self._scan, self._model, self._read = scan, model, read

@@ -102,7 +102,7 @@ def doubtful(found: LogRatios, given: int, odds: float) -> list[int]:
 def accepted(query: Query, decisions: list[Decision], odds: float) -> list[Decision]:
     """Return the decisions, of pairs that are not accepted at these odds that they are deferred.
 
-    Observations with ids are trusted.
+    Observations with ids are accepted.
     """
     scan, tracks, ids = query.scan, query.scan.tracks, query.ids
     mapped = [name in tracks.confirmed or name in tracks.known for name, _ in decisions]

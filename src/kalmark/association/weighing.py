@@ -27,14 +27,14 @@ WIDEST = 256  # candidates for an observation
 class Weighing(Gated):
     """Matchings as wholes, of landmarks however many are inside a gate.
 
-    What is likely not to be in the map, by all matchings together, is new.  Where a gate holds more than one landmark
-    on average, not counting those just seen, or its heading is unknown, the robot is lost: pairs are then not held
-    against the pose one by one.
+    An observation of what is likely not in the map, by all matchings together, is new.  Where a gate holds more than
+    one landmark on average, not counting those just seen, or its heading is unknown, the robot is lost: pairs are then
+    not held against the pose one by one.
     """
 
     most_nodes: Annotated[Count, "Comparisons of pairs after which the search ends."] = 5_000_000
 
-    weighs: ClassVar[bool] = True  # it says itself what is ambiguous
+    weighs: ClassVar[bool] = True  # it decides itself what is ambiguous
     nearest: ClassVar[int] = 8
     farther: ClassVar[float] = math.inf
 
@@ -63,15 +63,15 @@ class Weighing(Gated):
         if not lost and not fit[~just].any() and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
             query.learn(fit.sum())
             return Matched(np.where(fit.any(axis=1), fit.argmax(axis=1), -1), {})
-        near: Flags = np.isfinite(d2) if lost else fit  # far off, the distances themselves are not to be trusted
+        near: Flags = np.isfinite(d2) if lost else fit  # far off, the distances themselves are not valid
         search = self.gate, self.most_nodes, query.experience()
         found = posterior(together, open_, d2, near, just, query.dof(), *search)
-        told = np.asarray(near.any(axis=1))
-        pairs, reasons, mixed = self.choose(query, names, found, told, lost)
-        none = np.where(told, found.none() if found.finished else np.nan, np.where(d2.min(axis=1) > far, 1.0, np.nan))
+        paired = np.asarray(near.any(axis=1))
+        pairs, reasons, mixed = self.choose(query, names, found, paired, lost)
+        none = np.where(paired, found.none() if found.finished else np.nan, np.where(d2.min(axis=1) > far, 1.0, np.nan))
         if lost and (pairs == REMAP).all():  # it has not recognised anything
             return self.remapped(np.where(just, d2, np.inf), gate, far, reasons)
-        for row in np.flatnonzero(told & (none >= NONE)).tolist() if not lost else ():
+        for row in np.flatnonzero(paired & (none >= NONE)).tolist() if not lost else ():
             pairs[row], reasons[row] = NEW, "no landmark is likely there"
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
             if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
@@ -80,7 +80,7 @@ class Weighing(Gated):
         return Matched(pairs, reasons, mixed)
 
     def remapped(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:
-        """Pair what a lost robot sees with what it has just seen, at these d2 (K, L); the rest is strange to it."""
+        """Pair the observations of a lost robot with landmarks just seen, by d2 (K, L); map others again."""
         pairs = assigned(d2, gate)
         pairs = np.where(pairs >= 0, pairs, np.where(d2.min(axis=1) > far, REMAP, DEFERRED))
         return Matched(pairs, reasons)
@@ -163,7 +163,7 @@ class Cliques(Gated):
 
     Bailey 2002.
 
-    Two pairs agree if the landmarks are as far from each other as what was seen is; the pose is not asked before the
+    Two pairs agree if the landmarks are as far from each other as the observations are; the pose is not used before the
     joint test.  Where two sets as large contradict each other, both are deferred.  For the closing of loops.
     """
 

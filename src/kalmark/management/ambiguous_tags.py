@@ -1,8 +1,8 @@
 """Tags whose pose one scan does not determine, or whose pixels are far from what is expected of them.
 
-*Planar pose ambiguity*: from afar a tag looks the same when it is mirrored along the line of sight.  Each scan says how
-much worse the other pose fits, as a difference of chi-squares; the tag starts when their sum decides.  Schweighofer and
-Pinz 2006.
+*Planar pose ambiguity*: from afar the corners are nearly the same when the tag is mirrored along the line of sight.
+Each scan gives how much worse the other pose fits, as a difference of chi-squares; the tag starts when their sum
+decides.  Schweighofer and Pinz 2006.
 
 *Pose-based relinearisation*, as after a time without any measurement: the pixels of a tag's corners are linear in its
 pose over some degrees only.  Farther away their Jacobians mislead, and behind the camera there are none.  The pose that

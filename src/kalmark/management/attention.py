@@ -1,4 +1,4 @@
-"""The part of a scan that is used: landmarks to correct, observations to start new ones, landmarks to give up.
+"""The part of a scan that is used: landmarks to correct, observations to start new ones, landmarks to remove.
 
 Measurement selection: Davison 2005; [TB] 4.4.
 """
@@ -40,24 +40,24 @@ class Attention:
         tuple[int, int], Within(ge=1), "New landmarks are spread over so many columns and rows of the image."
     ] = (1, 1)
     margin_px: Annotated[NotNegative, "No new landmark nearer to the image's border than this."] = 0.0
-    delete: Annotated[bool, "Give up landmarks that are not found again."] = False
+    delete: Annotated[bool, "Remove landmarks that are not found again."] = False
     searches: Annotated[
-        int, Within(ge=0), "With `delete`: how often a landmark was expected before it may be given up."
+        int, Within(ge=0), "With `delete`: how often a landmark was expected before it may be removed."
     ] = 10
     match_ratio: Annotated[
-        float, Within(ge=0, le=1), "With `delete`: give it up if it was found in less than this share of them."
+        float, Within(ge=0, le=1), "With `delete`: remove it if it was found in less than this share of them."
     ] = 0.1
     inlier_ratio: Annotated[
         float,
         Within(ge=0, le=1),
-        "With `delete`: give it up if less than this share of what was found passed the gate.",
+        "With `delete`: remove it if less than this share of what was found passed the gate.",
     ] = 0.5
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "grid", tuple(self.grid))
 
     def worth_a_correction(self, information: Array) -> Flags:
-        """Return which of the observations are corrected by, given what they tell (K,): the best `updates` of them."""
+        """Return which observations are used, given their information (K,): the best `updates` of them."""
         best = np.zeros(len(information), dtype=np.bool_)
         best[np.argsort(-information, kind="stable")[: self.updates]] = True
         return best
@@ -93,7 +93,7 @@ class Attention:
         return found
 
     def hopeless(self, searched: int, matched: int, fitted: int) -> str:
-        """Return why a landmark searched, found and fitted so often is given up, "" if it is not."""
+        """Return why a landmark searched, found and fitted so often is removed, "" if it is not."""
         if searched < self.searches:
             return ""
         if matched < self.match_ratio * searched:

@@ -1,9 +1,9 @@
 """Rays of a camera whose mount is in the map: which are started again, in place of a depth that the mount leaves open.
 
 A ray is seen along h - rho t, t the way from its anchor to the camera.  Where the camera turns about its robot, the
-lever arm of the mount is a part of t.  While rho is open, too, images measure the product of two unknowns: what they
-say of the mount then is far from Gaussian, with its rotation it can have two maxima, and no later image repairs a
-correction towards the wrong one.  docs/bearing_only.md.
+lever arm of the mount is a part of t.  While rho is open, too, images measure the product of two unknowns: their
+likelihood of the mount then is far from Gaussian, with its rotation it can have two maxima, and no later image repairs
+a correction towards the wrong one.  docs/bearing_only.md.
 """
 
 from __future__ import annotations

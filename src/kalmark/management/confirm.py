@@ -49,7 +49,7 @@ def matched(
 ) -> tuple[list[Match], list[Observation]]:
     """Compare the observations `rows` with the tentative landmarks; return the pairs, and what is to be left alone.
 
-    `lost` (K,) are observations of a robot that does not know its place.
+    `lost` (K,) are observations of a robot whose pose is unknown.
     """
     kinds, tentative = scan.channel.models, scan.tracks.tentative.items()
     names = [name for name, track in tentative if track.model.kind in kinds and track.of is None]
@@ -72,7 +72,7 @@ def matched(
 
 
 def in_view(scan: ScanContext, names: Sequence[Id]) -> list[Id]:
-    """Return which of the tentative landmarks the sensor should observe; all if its model does not say."""
+    """Return which of the tentative landmarks the sensor should observe; all if its model has no field of view."""
     if not isinstance(scan.channel.sensor, Visible):
         return list(names)
     tentative, found = scan.tracks.tentative, list[Id]()
@@ -104,7 +104,7 @@ def residual(
 def _distances(scan: ScanContext, rows: Sequence[int], names: Sequence[Id], lost: Flags) -> Array:
     """Return d2 (K, L) of observations from tentative landmarks, inf where they are not among the nearest.
 
-    A robot that is `lost` observes only those whose place it knows.
+    A `lost` observation is compared only with landmarks of well-known relative position.
     """
     tracks = [scan.tracks.tentative[name] for name in names]
     near = np.ones((len(rows), len(names)), dtype=np.bool_)

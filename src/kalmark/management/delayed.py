@@ -9,7 +9,7 @@ The clones are blocks of the map, so that they stay correlated with all else and
 closures too; a landmark started from them has its right covariance with the robot and the map
 (docs/bearing_only.md).  The candidates themselves correct nothing.
 
-A sensor that can do this says where two of its measurements `meet`; all else is the same for bearings and ranges.
+A sensor that can do this computes where two of its measurements `meet`; all else is the same for bearings and ranges.
 """
 
 from __future__ import annotations
@@ -179,7 +179,7 @@ def _seen_from_the_next(scan: ScanContext, c: Pending) -> Pending:
 
 # ---------------------------------------------------------------------- landmarks
 class Outcome(NamedTuple):
-    """What becomes of a candidate: the candidates left, why, and the landmark it starts, from which measurements."""
+    """The outcome of a candidate: the candidates left, why, and the landmark it starts, from which measurements."""
 
     candidates: Candidates
     reason: str

@@ -1,4 +1,4 @@
-"""A landmark of unknown depth whose distance another sensor tells.
+"""Landmarks of unknown depth whose distance another sensor measures.
 
 A range is not linear in an inverse distance that is uncertain by its own size: from a prior of one, a step towards the
 range passes zero.  The inverse of the range is linear in it.  So where range and expectation are far apart, the map is
@@ -20,9 +20,9 @@ from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 
 FAR, SIGMAS = 0.1, 3.0  # relative difference of distances, and by how many sigmas, beyond which one is far
-SHARE = 100.0  # inverse ranges count a hundredth of what they tell: enough to relinearise, and the ranges count again
+SHARE = 100.0  # inverse ranges have a hundredth of their information: enough to relinearise, and the ranges count again
 SCALES = np.geomspace(1e-2, 1e2, 81)  # of the expected distance, among which the measured one is searched
-TINY = 1e-12  # information below which a measurement does not tell a distance
+TINY = 1e-12  # information below which a measurement does not determine a distance
 STEPS = 5  # of Gauss-Newton from the best of them
 
 
@@ -93,7 +93,7 @@ def _scales(scan: ScanContext, v: Array, y: Array, R: Array) -> tuple[Array, Arr
     """
     sensor, W = scan.channel.calibrated(scan.map), np.linalg.inv(R)
     angular, d = np.array(sensor.angular, dtype=np.bool_), v.shape[1]
-    velocity = np.tile(scan.channel.velocity(scan.map, scan.robot), (len(v), 1))  # of a sensor that sees it
+    velocity = np.tile(scan.channel.velocity(scan.map, scan.robot), (len(v), 1))  # of a sensor that measures it
 
     def compared(scales: Array) -> tuple[Array, Array]:
         """Return innovations z (K, m) and their derivatives (K, m) in the logarithms of the scales (K,)."""

@@ -151,7 +151,7 @@ def order(tracks: Tracks, pairs: Sequence[Pair]) -> list[Pair]:
 
 
 class _Reading(NamedTuple):
-    """What is read to compare landmarks of d dimensions."""
+    """Data to compare landmarks of d dimensions."""
 
     map: Map
     tracks: Tracks

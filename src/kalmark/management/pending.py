@@ -1,8 +1,8 @@
-"""Deferred initialisation: what a way to start landmarks late may ask for, step by step.
+"""Deferred initialisation: the steps that a method of starting landmarks late returns.
 
-All ways are one idea: measurements made from cloned poses, pending until a test passes.  They differ in the solver:
+All methods are one idea: measurements made from cloned poses, pending until a test passes.  They differ in the solver:
 where bearings intersect (`delayed`), where ranges meet (`trilateration`), which of several directions a range has
-(`hypotheses`), which of two poses a tag has (`tags`).  A way reads and returns steps; `Slam` applies them.
+(`hypotheses`), which of two poses a tag has (`tags`).  A method reads and returns steps; `Slam` applies them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class HypothesisCorrection(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What becomes of an observation of a pending landmark, and what is to be done, in this order.
+    """The outcome of an observation of a pending landmark, and the actions that follow, in this order.
 
     `pending` is what is known of it after the step, None where that stays as it is.  `corrections` of hypotheses,
     hypotheses to be `added`; with `keep`, the measurement is kept with a clone of the pose.  `removed` are slots of

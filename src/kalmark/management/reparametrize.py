@@ -20,7 +20,7 @@ NO_LENS = np.zeros(0)
 
 @runtime_checkable
 class _PriorDirection(Protocol):
-    """A line whose direction in the plane of sight began as a prior, so that only pixels say how sharp its ends are."""
+    """A line whose direction in the plane of sight began as a prior: only pixels determine the accuracy of its ends."""
 
     prior_beta_1: float
     switch_px: float

@@ -40,7 +40,7 @@ MOST_TRIANGLES, MOST_MATCHES, TRIES = 60_000, 8_000, 24
 JUDGED = 6  # constellations, the largest
 FEWEST = 5  # pairs
 SIGMAS = 4.0  # by which landmarks that agree may miss, and
-SLACK = 0.04  # of the spacing of landmarks, for what the filter does not know of its errors
+SLACK = 0.04  # of the spacing of landmarks, for errors that are not in the covariance
 LOOSE = 0.25  # of the spacing, above which a landmark is not paired
 ROUNDS = 12
 FALSE_ALARMS = 1e-3  # expected of a map without repeats
@@ -51,7 +51,7 @@ FITS = 0.9999  # of right shapes pass
 GROWN, GROWN_BY = 5, 0.2  # landmarks that have come or gone, or so many of all, until a map is searched again
 TURNED_RAD = 0.1  # a sigma of the turn that is allowed for at least
 IN_A_REPEAT = "in a repeat"  # ends the reason of a merge
-CLEAR = 0.2  # from a half, the share of the last scan's landmarks that says in which part a robot is
+CLEAR = 0.2  # from a half, the share of the last scan's landmarks that decides in which part a robot is
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
 
 

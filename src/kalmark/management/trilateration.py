@@ -37,7 +37,7 @@ SHAPE = 2.0  # and by how much less the likelihood may fall off there than a Gau
 
 
 class Fits(NamedTuple):
-    """How J positions l (J, 2) fit n ranges: `cost` = -2 log likelihood and chi-square (J,), residuals z (J, n).
+    """Fit of J positions l (J, 2) to n ranges: `cost` = -2 log likelihood and chi-square (J,), residuals z (J, n).
 
     `H` (J, n, 2) is with respect to the position, `H_x` (J, n, k + 2 n) to the sensor's own parameters in the map and
     its places, `inverse` (J, n, n) that of the covariance, and `R` (J, n) the ranges' variances, as the position would
@@ -55,7 +55,7 @@ class Fits(NamedTuple):
 
 
 class RangeProblem(NamedTuple):
-    """How positions (J, 2) fit ranges from the sensor's places (n, 2), and the blocks that those depend on.
+    """Fit of positions (J, 2) to ranges from the sensor's places (n, 2), and the blocks that those depend on.
 
     `S` is the covariance of the sensor's k own parameters and its places, `S_x` (k + 2 n, .) their Jacobian.
     """
@@ -68,7 +68,7 @@ class RangeProblem(NamedTuple):
 
     @property
     def own(self) -> int:
-        """How many parameters the sensor has in the map."""
+        """Number of the sensor's parameters in the map."""
         return len(self.S) - self.places.size
 
 
@@ -96,7 +96,7 @@ class Trilateration:
         return Step("deferred", "", keep=True)
 
     def solve(self, scan: ScanContext, pending: Pending) -> Step:
-        """Start the landmark if its ranges determine it; of too many ranges give up every other one."""
+        """Start the landmark if its ranges determine it; of too many ranges drop every other one."""
         if len(pending.measurements) < 3:
             return Step("deferred", "it takes three ranges to determine a position")
         found = self._answer(scan, pending)

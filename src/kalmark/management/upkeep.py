@@ -9,7 +9,7 @@ from kalmark.declare import Count, Probability, Within, refuse, register
 
 @register("upkeep", "upkeep")
 class Upkeep:
-    """What makes a landmark of sightings without an id: docs/association.md.
+    """Confirmation of landmarks from observations without an id: docs/association.md.
 
     An observation without an id that belongs to no landmark starts a *tentative* one, which becomes a landmark when it
     was seen `confirm` times within `within` scans in which it was in the sensor's view, and is dropped when that cannot
@@ -18,15 +18,16 @@ class Upkeep:
 
     With `merge`, two landmarks that turn out to be one are merged (`merge.py`) when that is `odds` times
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
-    (`association/ratio.py`); what is held back by that is mapped anew until then, as is what a robot that is lost sees.
+    (`association/ratio.py`); what is held back by that is mapped anew until then, as are observations of a robot that
+    is lost.
 
     With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are
     searched while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those beyond doubt.
 
     A landmark without an id that should be seen and is not is marked, with `gone` "remove" removed, when it is `odds`
-    times likelier that nothing is there (`existence.py`).  The probability that the sensor sees a landmark in its view
-    is found in the log.  Where it is stated, `p_detect`, each scan counts, with ids too, and what is gone is removed.
-    `p_false` is the probability that something else is taken for a landmark that is gone.
+    times likelier that nothing is there (`existence.py`).  The detection probability of the sensor
+    is estimated from the log.  Where it is stated, `p_detect`, each scan counts, with ids too, and what is gone is
+    removed.  `p_false` is the probability that something else is taken for a landmark that is gone.
     """
 
     confirm: Annotated[

@@ -39,8 +39,8 @@ def grown(scan: ScanContext, tracks: Sequence[Track], rows: Sequence[int]) -> li
     model: Any = tracks[0].model
     l = scan.map.means(np.array([track.slot for track in tracks]), model.space.size)
     more = model.abscissas(scan.pose(), l, scan.channel.sensor.invert(scan.y[[*rows]])[0])
-    told = zip(tracks, more, strict=True)
-    return [_hull(t.extent, m) if t.extent is not None and model.extend else t.extent for t, m in told]
+    pairs = zip(tracks, more, strict=True)
+    return [_hull(t.extent, m) if t.extent is not None and model.extend else t.extent for t, m in pairs]
 
 
 def first_extent(scan: ScanContext, track: Track, k: int) -> Array:

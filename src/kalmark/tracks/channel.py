@@ -1,4 +1,4 @@
-"""A channel: a mounted sensor as the filter sees it, with an observation model for each kind of block."""
+"""A channel: a mounted sensor with an observation model for each kind of block."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
 
 @dataclass(frozen=True, eq=False)
 class ObservationModel:
-    """How a sensor on a mount `at` observes landmarks of one type."""
+    """Observation of landmarks of one type by a sensor on a mount `at`."""
 
     landmark: Landmark
     sensor: Any
@@ -53,7 +53,7 @@ class ObservationModel:
 
     @cached_property
     def model(self) -> Any:
-        """What `linearize` takes.  Made when it is first needed: models that are built in are compiled then."""
+        """The view for `linearize`.  Made when it is first needed: models that are built in are compiled then."""
         return self.view()
 
     def view(self) -> Any:
@@ -74,7 +74,7 @@ class ObservationModel:
 
     @cached_property
     def d(self) -> int:
-        """How many of the landmark's numbers are observed."""
+        """Number of the landmark's components that are observed."""
         return self.landmark.space.size
 
     def predict(
@@ -100,11 +100,11 @@ class ObservationModel:
 
 
 class KnownModel(ObservationModel):
-    """How landmarks known exactly are observed: y (K, m + n) ends with their numbers, and the slots are the robot's."""
+    """Observation of landmarks known exactly: y (K, m + n) ends with their numbers, and the slots are the robot's."""
 
     @cached_property
     def model(self) -> Any:
-        """What `linearize` takes."""
+        """The view for `linearize`."""
         return known_view(self.view())
 
     @cached_property
@@ -122,10 +122,9 @@ class Channel:
     """A sensor of a robot on its mount `at`, whose slot is `mount` (-1: not in the map), starting `landmark`s.
 
     `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
-    `motion` is that of its robot: a sensor that sees its velocity has it from the state; else it `counts`, from a clone
-    of the robot's pose at its last scan.  `since` (1 + k,): the seconds since then, and the control in force where that
-    has the turn rate.
-    `robust`: how outliers count less, one of `ROBUST` (None: all count in full).
+    `motion` is that of its robot: a sensor that measures its velocity has it from the state; else it `counts`, from a
+    clone of the robot's pose at its last scan.  `since` (1 + k,): the seconds since then, and the control in force
+    where that has the turn rate.  `robust`: how outliers count less, one of `ROBUST` (None: all count in full).
     """
 
     def __init__(
@@ -167,7 +166,7 @@ class Channel:
         if isinstance(sensor, protocols.FarCorrected):
             self.far = ObservationModel(landmark, TagPose(), self.at)
         rays = any(isinstance(model.landmark, AsPoint) for model in self.models.values())
-        self.depths = rays and (full or not self.sees_velocity)  # it tells depths; a range rate alone does not
+        self.depths = rays and (full or not self.sees_velocity)  # it determines depths; a range rate alone does not
 
     def _models(self, others: Sequence[Landmark]) -> dict[str, ObservationModel]:
         """Return the models of all kinds of blocks that this sensor can observe: its landmarks and those like them."""
@@ -228,7 +227,7 @@ class Channel:
         return pose if second < 0 else np.concatenate([pose, map_.mean(second)])
 
     def velocity(self, map_: Map, robot: int) -> Array:
-        """Return the velocity (2 or 3,) of a sensor that sees it, in its frame, of another one nothing (0,)."""
+        """Return the velocity (2 or 3,) of a sensor that measures it, in its frame, of another one nothing (0,)."""
         if not self.sees_velocity:
             return np.zeros(0)
         second, pose = map_.mean(self.second(robot)), map_.mean(robot)[: len(self.at)]

@@ -18,7 +18,7 @@ User = tuple[str, str]  # a channel: robot, sensor
 class Measurement:
     """The k-th observation y (m,) of a scan, its noise R (p, p), made from a cloned pose.
 
-    `own_noise`: R was given with the scan; else the sensor's model may tell it anew from where the landmark is.
+    `own_noise`: R was given with the scan; else the sensor's model may give it anew at the position of the landmark.
     """
 
     clone: int

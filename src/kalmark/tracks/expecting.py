@@ -58,7 +58,7 @@ def expectations(
         rows = np.array(group)
         slots = tracks.slots_of([names[i] for i in group])
         of = [tracks.confirmed.get(names[i]) for i in group]
-        seen = looked(map_, channel, slot, model, slots, of, told=not only_in_view)
+        seen = looked(map_, channel, slot, model, slots, of, reasons=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):
             why[i] = reason
         in_view[rows] = seen.in_view
@@ -70,7 +70,7 @@ def expectations(
         rows, known = np.array(group), [names[i] for i in group]
         l = tracks.known.means(known)
         extents = [tracks.known.extent(name) for name in known]
-        seen = look(channel, model, channel.pose(map_, slot), l, extents, told=not only_in_view)
+        seen = look(channel, model, channel.pose(map_, slot), l, extents, reasons=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):
             why[i] = reason
         in_view[rows] = seen.in_view
@@ -129,21 +129,21 @@ def _not_observed(channel: Channel, tracks: Tracks, name: Id, robot: str) -> str
 # ---------------------------------------------------------------------- in view
 def looked(
     map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, tracks: Sequence[Track | None],
-    told: bool = True,
+    reasons: bool = True,
 ) -> Looked:  # fmt: skip
-    """Return which blocks of one kind are in view, and measurements to linearise at; `told`: why the others are not."""
+    """Return which blocks of a kind are in view, and measurements to linearise at; `reasons`: why others are not."""
     T, l = channel.pose(map_, robot), map_.means(slots, model.d)
     sizes = [None if track is None else track.size_m for track in tracks]
-    return look(channel, model, T, l, [None if track is None else track.extent for track in tracks], sizes, told)
+    return look(channel, model, T, l, [None if track is None else track.extent for track in tracks], sizes, reasons)
 
 
 def look(
     channel: Channel, model: ObservationModel, T: Array, l: Array, extents: Sequence[Array | None],
-    sizes: Sequence[float | None] = (), told: bool = True,
+    sizes: Sequence[float | None] = (), reasons: bool = True,
 ) -> Looked:  # fmt: skip
     """Return which landmarks l (K, n) of one kind are in view from the pose T, and measurements to linearise at.
 
-    `extents` (2,) are those of lines, `sizes` in m those of tags; `told`: and why the others are not in view.
+    `extents` (2,) are those of lines, `sizes` in m those of tags; `reasons`: and why the others are not in view.
     """
     sensor: Any = channel.sensor
     columns: tuple[str, ...] = tuple(sensor.columns)
@@ -156,7 +156,7 @@ def look(
     v = in_frame(model.landmark, T, l)
     in_view = sensor.sees(v) if isinstance(sensor, protocols.Visible) else np.ones(len(v), dtype=np.bool_)
     why = [""] * len(v)
-    for i in np.flatnonzero(~in_view).tolist() if told else ():
+    for i in np.flatnonzero(~in_view).tolist() if reasons else ():
         why[i] = _out_of_view(sensor, v[i])
     if "qw" in columns:
         y[:, QUATERNION_AT] = 1.0

@@ -36,7 +36,7 @@ class FrontEnd(Protocol):
         ...
 
     def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Any:
-        """Return what it wants to know before it searches: what the sensor should measure of the landmarks in view."""
+        """Return the input of its search: the expected measurements of the landmarks in view."""
         ...
 
     def search(
@@ -53,11 +53,11 @@ class FrontEnd(Protocol):
         ...
 
     def learn(self, report: Report, T: Array) -> None:
-        """Learn what became of the last frame, its sensor being at T (7,)."""
+        """Take the report of the last frame, whose sensor is at T (7,)."""
         ...
 
     def watch_beginning(self) -> None:
-        """Keep the first frames, which alone move the map: together they may say how it begins."""
+        """Keep the first frames, which alone move the map: together they may determine its start."""
         ...
 
     def settle(self) -> None:
@@ -76,7 +76,7 @@ class FrontEnd(Protocol):
         ...
 
     def moved(self, poses: list[Array], names: Set[Id]) -> None:
-        """Learn that the sensor was at other poses (7,) in the frames so far, and that only `names` are landmarks."""
+        """Replace the poses (7,) of the sensor in the frames so far, and keep only `names` as landmarks."""
         ...
 
 

@@ -44,7 +44,7 @@ class _Group(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is believed of the landmarks in view after some measurements: e (K, m), joint S (m K, m K), C and d.
+    """Density of the landmarks in view after some measurements: e (K, m), joint S (m K, m K), C and d.
 
     A measurement has m numbers; those made of some landmarks are `PIXEL`s, the first two of them.
     """
@@ -140,7 +140,7 @@ class Prospect:
         C, S = joint(P, rows, E_h, E_l, at, width)
         return Belief(e, S, C, np.zeros(len(rows)))
 
-    # ------------------------------------------------------------------ what measurements say
+    # ------------------------------------------------------------------ corrections by measurements
     def innovations(self, belief: Belief, rows: Index) -> Array:
         """Return the covariances Z (k, 2, 2) of the innovations of some landmarks' pixels, each by itself."""
         return self.whole_innovations(belief, rows)[:, :PIXEL, :PIXEL]
@@ -169,7 +169,7 @@ class Prospect:
         return e
 
     def after(self, belief: Belief, rows: Sequence[int] | Index, y: Array) -> Belief:
-        """Return what is believed after measurements y (k, 2) of some landmarks."""
+        """Return the density after measurements y (k, 2) of some landmarks."""
         flat = _of_pixels(belief, rows)
         K, S_i = self._gain(belief, rows), belief.S[flat]
         d = belief.d + K @ (y - belief.pixels[rows]).ravel()

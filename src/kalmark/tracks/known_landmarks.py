@@ -44,7 +44,7 @@ class Known:
         self._forget()
 
     def _forget(self) -> None:
-        """Forget what was computed of all of them."""
+        """Clear what was computed of all of them."""
         self._tree: Any = None
         self._places: Array | None = None
         self._sorted: tuple[float, Array, Index] | None = None
@@ -57,7 +57,7 @@ class Known:
 
     @property
     def counts(self) -> Index:
-        """How many observations of each were used (N,)."""
+        """Number of used observations of each (N,)."""
         return self._counts[: len(self.names)]
 
     def add(self, name: Id, mean: Array) -> int:
@@ -79,7 +79,7 @@ class Known:
         self._forget()
 
     def places(self) -> Array:
-        """Return where they are (N, 2 or 3), NaN of what does not say."""
+        """Return where they are (N, 2 or 3), NaN where their model has no position."""
         if self._places is None:
             placed = place_of(self.model, self.values) if len(self.names) else None
             d = 2 if self.model.space.world == "plane" else 3

@@ -5,7 +5,7 @@ An observation h is compared with its linearisation H at the sigma points x (+) 
     n = h(x (+) d) - h(x) - H d,        |n| <= SHARE |H d| + 1        in sigmas of the noise
 
 So a range at the middle of the robot needs no heading, however unknown that is, until the robot has moved.  An
-iterated correction bears a part `SHARE` of the change, and what is within the noise says nothing.
+iterated correction bears a part `SHARE` of the change, and a difference within the noise is not counted.
 
 A place that is observed in the frame of the robot turns with the heading: v (E(d) - I).  There n and H d have the same
 factor v, and the condition is one on the heading alone: `TURN_RAD`.

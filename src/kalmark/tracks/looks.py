@@ -1,7 +1,7 @@
 """Looks of a sensor at the landmarks about it, and its detection probability over the field of view, counted in them.
 
-A look is a scan that is told from the last one by where the sensor is: scans in a row miss a landmark for the same
-reason.  What is seen of what is expected depends on the range, the bearing and on what stands nearer; each is counted
+A look is a scan from another pose than the last one: scans in a row miss a landmark for the same reason.  The detection
+probability depends on the range, the bearing and on objects that stand nearer; each is counted
 by itself, so that a chance where little is seen (beyond the reach of a detector, behind a tree) counts for little.
 """
 

@@ -1,4 +1,4 @@
-"""One scan with all that it is read against.  Who is handed it reads; only `Slam` changes the map and the tracks."""
+"""One scan with the map and tracks that it is compared with, read-only: only `Slam` changes these."""
 
 from __future__ import annotations
 

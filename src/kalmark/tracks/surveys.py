@@ -1,7 +1,7 @@
-"""Surveyed landmarks whose sightings do not fit: whether they stand elsewhere, or their robot.
+"""Surveyed landmarks whose observations do not fit: a test whether the survey or the pose is wrong.
 
-A sighting outside its gate is left out, as a fix is.  Sightings of two such landmarks with none between that fits say
-that the robot is elsewhere, not they: those are taken.  A landmark of which five sightings in a row do not fit, while
+An observation outside its gate is left out, as a fix is.  Observations of two such landmarks with none between that
+fits show that the robot is elsewhere: those are used.  A landmark of which five sightings in a row do not fit, while
 those of twice as many landmarks do as do not, stands elsewhere: it is removed, and its next sighting maps it anew.
 """
 
@@ -13,11 +13,11 @@ from kalmark.events import Id
 
 SURVEYED = 0.9999  # of right sightings are within the gate
 MISFITS, TWICE = 5, 2  # sightings in a row that do not fit, and landmarks that do: the survey is wrong
-TRUSTED = 5  # sightings that fit, after which it is right
+TRUSTED = 5  # observations that fit, after which it is right
 
 
 class Surveys:
-    """What sightings say of surveys.  `trial`: of landmarks in the map, how many sightings have fitted so far.
+    """Test of surveys by observations.  `trial`: of landmarks in the map, how many sightings have fitted so far.
 
     `misfits`: how many sightings in a row did not fit, and which landmarks did meanwhile.  `strangers`: by robot,
     the landmarks that did not fit since one did.

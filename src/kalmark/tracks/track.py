@@ -21,12 +21,12 @@ from kalmark.tracks.looks import Looks
 Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan
 ChannelKey = tuple[str, str]  # robot, sensor
 
-FORGETTING = 0.9  # factor by which what was learnt counts less from one scan to the next
+FORGETTING = 0.9  # forgetting factor of the count of observations, from one scan to the next
 RECENT = 12  # landmarks observed most recently, beside those of the last scan
 
 
 class Status(Enum):
-    """How far a landmark has come: no block yet, a block that corrects nothing, or a landmark of the map."""
+    """Stage of a landmark: no block yet, a block that corrects nothing, or a landmark of the map."""
 
     PENDING = "pending"
     TENTATIVE = "tentative"
@@ -60,13 +60,13 @@ class Pending:
 
 @dataclass
 class Track:
-    """What is known of one landmark.
+    """The record of one landmark.
 
     `slot` is its block, -1 while it has none.  `observations` counts those that were used.  `searched` and `found`
     count the scans in which it was expected and observed; `hits` of `chances` are these of a tentative one, `unseen`
     the scans since it was last observed.  `seen` are the looks (`looks.py`) that saw it again, `absent` those before
     the last of them that should have and did not, `missed` those since.  `covisible` landmarks were observed in one
-    scan with it.  `compared` says after how many observations, and after how many changes of the map, it was last
+    scan with it.  `compared` counts after how many observations, and after how many changes of the map, it was last
     compared with others.  `extent` (2,) are the abscissas of the segment observed of a line, `size_m` is the measured
     size of a tag.  `first` is the observation that started it, and
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
@@ -229,7 +229,7 @@ class Tracks:
             self.last_scan = names
 
     def learn(self, again: float) -> None:
-        """Remember how many observations of a scan were of landmarks just seen, the less the longer ago."""
+        """Count the observations of a scan that were of landmarks just seen, with a forgetting factor."""
         if again > 0:
             self.experience = FORGETTING * self.experience + again
 
