@@ -201,7 +201,7 @@ def test_a_sum_is_kept_when_a_map_is_saved(tmp_path: Path) -> None:
     ("hall", "why"),
     [
         (Hall(0, beacons="n"), "takes two known landmarks"),
-        (Hall(0, sensor=km.sensors.Bearing(0.02)), "tells no distance"),
+        (Hall(0, sensor=km.sensors.Bearing(0.02)), "determines no distance"),
     ],
 )
 def test_what_cannot_place_a_robot_waits_with_the_reason_and_what_would_help(hall: Hall, why: str) -> None:

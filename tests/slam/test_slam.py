@@ -103,7 +103,7 @@ def test_a_bad_event_is_refused_with_one_line_and_changes_nothing(name: str) -> 
             lambda: km.Slam(rover(), reparametrize="off"),
             "reparametrize is 'off', expected a number of at least 0, or No",
         ),
-        (lambda: km.Slam(rover()).covariance(), "covariance of nothing was asked for, expected names of robots"),
+        (lambda: km.Slam(rover()).covariance(), "covariance of no blocks, expected names of robots"),
         (lambda: km.Slam(rover()).covariance(["rover"]), "['rover'] is not in the map, expected 'rover' or one of"),
         (lambda: km.Slam(rover()).remove(["rover"]), "['rover'] is not in the map"),
         (lambda: km.Slam(rover()).add_landmark(1, (0, 0), landmark="point"), "landmark 1 is 'point', expected a landm"),
@@ -423,7 +423,7 @@ def test_a_landmark_is_where_its_model_says() -> None:
 
 
 class Around:
-    """A point of the plane by its direction from the origin and its distance, which does not say where it is."""
+    """A point of the plane by its direction from the origin and its distance, which has no position."""
 
     kind = "around"
     space = Space("around", (HEADING, SCALAR))
@@ -461,5 +461,5 @@ def test_a_user_s_landmark_is_where_its_place_says_and_so_in_the_tables() -> Non
     header, row, *_ = MapLandmarks.of(slam).to_csv().splitlines()
     assert header.split(",")[2:4] == ["x_m", "y_m"]
     np.testing.assert_allclose([float(x) for x in row.split(",")[2:4]], where)
-    with pytest.raises(MapError, match="1 is a around, which does not say where it is"):
+    with pytest.raises(MapError, match="1 is a around, which has no position"):
         started(landmarks=Around()).place(1)

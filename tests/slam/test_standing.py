@@ -151,7 +151,7 @@ def test_a_reading_of_zero_velocity_in_a_log_is_one_like_any_other() -> None:
 
 def test_a_robot_of_which_nothing_tells_that_it_stands_is_refused() -> None:
     zero = {"still": km.Mount(km.sensors.ZeroVelocity2D())}
-    with pytest.raises(ModelError, match="robot 'r': nothing tells a ZeroVelocity2D speed and turn rate, expected"):
+    with pytest.raises(ModelError, match="robot 'r': ZeroVelocity2D has no input of speed and turn rate, expected"):
         km.Slam(km.Robot("r", motion=km.motion.ConstantVelocity(), sensors=zero))
     with pytest.raises(ModelError, match="robot 'r' has two ZeroVelocity2D, expected one"):
         km.Slam(km.Robot("r", motion=km.motion.Unicycle(), sensors=zero | {"too": zero["still"]}))

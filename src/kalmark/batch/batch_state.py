@@ -87,7 +87,7 @@ def plus(space: Space, x: Array, d: Array, turns: Array) -> Array:
 def looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
     """Return the innovations z (K, p) of y (K, m) and E (K, p, h + n) by the errors of head and landmark.  [S] (63).
 
-    Row for row a `head` (K, .), pose and mount as of `kalmark.models.observe`, sees a landmark l (K, .).
+    Row for row a `head` (K, .), pose and mount as of `kalmark.models.observe`, observes a landmark l (K, .).
     """
     look = _looked if isinstance(view, tuple) else in_python(_looked)
     return look(view, *(np.ascontiguousarray(a) for a in (head, l, y)))

@@ -67,7 +67,7 @@ class Associations:
 
 @dataclass(frozen=True, eq=False)
 class BatchInput:
-    """What a batch solution needs beside the events: robots and their starts, associations, initial values.
+    """Inputs of a batch solution beside the events: robots and their starts, associations, initial values.
 
     The S scans have the times `t_ns` (S,) and are of the `robot` (S,), `poses` (S, 3) or (S, 7) are the initial poses
     there.  `landmarks` has the initial means, of the type `landmark`, and covariances of those in the map.  Of the
@@ -76,7 +76,7 @@ class BatchInput:
 
     Without `motion` each pose is on its own, but for those that share landmarks: of each such part without a landmark
     that is known exactly the first pose is held.  `mounts`, by robot and sensor, are the means of those that are not
-    known: solved for where another sensor sees something at the same pose, else held.  Sightings with whitened
+    known: solved for where another sensor has observations at the same pose, else held.  Sightings with whitened
     residuals beyond `huber` count less.
 
     `biases` are the constants (c,) of the controls of a robot.
@@ -198,7 +198,7 @@ class BatchReplay:
             return event if detector is None else detector(event)
         if not isinstance(detector, FrameDetector):
             why = f"{event.sensor!r} searched its images where the filter expected landmarks"
-            raise unsolved(f"{when(event)}: {why}, expected scans, or a detector that looks at each image by itself")
+            raise unsolved(f"{when(event)}: {why}, expected scans, or a detector that searches each image by itself")
         return detector.scan_of(event)
 
     def _scan(self, scan: Scan, rows: list[int]) -> None:
@@ -265,7 +265,7 @@ class BatchReplay:
         return Problem(motion, (*seen, *self._positions(names)), free, state, names, nodes, robots, kind)
 
     def _names(self) -> list[Id]:
-        """Return the landmarks.  One that was measured by fewer numbers than it has says nothing and is left out."""
+        """Return the landmarks.  One that was measured by fewer numbers than it has is left out."""
         numbers: dict[Id, int] = {}
         for (_, _, group), seen in self.sighted.items():
             for one in seen if group == LANDMARKS else ():

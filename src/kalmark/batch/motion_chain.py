@@ -80,7 +80,7 @@ class Course:
         self.shared: dict[int, Array] = {}
 
     def forget(self) -> None:
-        """Have any motion since the node, and no control in force."""
+        """Allow any motion since the node, without a control in force."""
         self.reset(self.node)
         gaps = self.drive.gaps
         if gaps is not None:
@@ -170,7 +170,7 @@ class Chain:
                 course.add(part, self.roots)
 
     def lose(self, robot: str) -> None:
-        """Forget how a robot moves from its last node on, until now."""
+        """Drop the motion of a robot from its last node on, until now."""
         self.courses[robot].forget()
 
     def node_at(self, robot: str, t_ns: int) -> int:

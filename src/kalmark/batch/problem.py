@@ -1,4 +1,4 @@
-"""The least-squares problem of a whole log: what sensors, surveys and the motion between poses say of the state.
+"""The least-squares problem of a whole log: residuals of sensors, surveys and the motion between poses.
 
 Everything is vectorised over the whole log: one factor holds all the observations of one mounted sensor.  The motion is
 carried as constraints with a covariance that may be singular: a held control has two errors for the three coordinates
@@ -119,7 +119,7 @@ def sightings(
 ) -> Factor:
     """Return what a mounted sensor measured, y (K, m) with noise R (K, p, p).  [S] (63).
 
-    `view` is how it sees landmarks (`kalmark.models.observe`); the blocks are the poses, its mount if that is unknown,
+    `view` is its observation model (`kalmark.models.observe`); the blocks are the poses, its mount if that is unknown,
     and the targets, landmarks or the positions of other poses.
     """
 
@@ -199,8 +199,9 @@ class Linearized(NamedTuple):
 class Problem:
     """Minimise the whitened residuals + w' Q^+ w, w the errors of the motion, which must lie in the range of Q.
 
-    `free` says which numbers of a step are unknown; the others are held.  The search begins at `start`.  `ids` name the
-    landmarks, of `kind`, and `nodes` (S,) are the poses at the scans of the log; `robots` (n,) are those of all poses.
+    `free` marks the numbers of a step that are unknown; the others are held.  The search begins at `start`.  `ids` name
+    the landmarks, of `kind`, and `nodes` (S,) are the poses at the scans of the log; `robots` (n,) are those of all
+    poses.
     """
 
     motions: Motions

@@ -1,8 +1,8 @@
-"""Associations decided again about the batch solution, where the log does not tell them.
+"""Associations decided again at the batch solution, for observations without ids in the log.
 
-The filter decided each association with what it knew then.  At the optimum every pose knows the whole log: each
-observation is compared again with the landmarks near it, landmarks that coincide are merged, what fits none and repeats
-itself becomes a landmark, and the optimum of these associations is found; until nothing changes.  This is iterated
+The filter decided each association by the data until then.  At the optimum every pose depends on the whole log: each
+observation is compared again with the landmarks near it, landmarks that coincide are merged, repeated observations that
+fit none become a landmark, and the optimum of these associations is found; until nothing changes.  This is iterated
 conditional maximisation (Besag 1986) of the likelihood over associations and states: it never trades one hypothesis
 against another, so it can end in another maximum than the best.  Derivation of the optimum: docs/batch.md.
 """
@@ -43,8 +43,8 @@ FAR = 1e9  # d2 of what is no candidate
 class Reassociated:
     """The optimum with its own associations: the `landmark` (O,) of each observation, None for none.
 
-    `merged` says which landmark another one has become, `new` are those that the filter did not have.  Not `settled` if
-    the last of the `rounds` still changed something.
+    `merged` maps a landmark to the one it was merged into, `new` are those that the filter did not have.  Not `settled`
+    if the last of the `rounds` still changed something.
     """
 
     batch: Batch
@@ -105,7 +105,7 @@ class _Seen(NamedTuple):
 
 
 class _Look:
-    """How the observations look from the poses of a solution."""
+    """The observations from the poses of a solution."""
 
     def __init__(self, replay: BatchReplay, batch: Batch, may_change: Flags) -> None:
         self.scan, self.ids = replay.given.associations.scan, batch.ids

@@ -1,8 +1,8 @@
 """The optimum of a problem by Gauss-Newton, by Newton's method once near, or by Levenberg's method.
 
-A step is taken along the exponential: a stretch of the path that turns takes the landmarks it sees along.  With motion
+A step is taken along the exponential: a stretch of the path that turns takes its observed landmarks along.  With motion
 it is halved until the merit falls, which is the cost plus an exact penalty on the constraints (Nocedal & Wright,
-Numerical Optimization, 18.3).  Outliers make Gauss-Newton crawl, so the last steps count the curvature.
+Numerical Optimization, 18.3).  Outliers make Gauss-Newton slow, so the last steps use the curvature.
 
 The step dx and the multipliers m of `minimise |z - H dx|^2 + w' Q^+ w subject to w = e + J dx` solve
 
@@ -33,7 +33,7 @@ from kalmark.errors import KalmarkError
 from kalmark.events import Id
 
 NEAR = 1e-2  # relative step below which Newton's method is tried
-ROUNDING = 1e-6  # relative step below which the cost cannot tell any more which of two states is better
+ROUNDING = 1e-6  # relative step below which the cost does not distinguish which of two states is better
 DAMPING = 1e-4  # the first of Levenberg's method
 CHUNK = 128  # columns of the Schur complement at once: bounds the memory
 KEPT = 10_000_000  # numbers of what the path makes of landmarks and mounts, up to which they are kept for each solution

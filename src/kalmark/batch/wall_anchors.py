@@ -1,7 +1,7 @@
-"""Walls in the batch problem: where the anchor of each is along its line, which no sighting measures.
+"""Walls in the batch problem: the position of each anchor along its line, which no observation measures.
 
 A wall is a point on its line and the direction of its normal.  As in the filter (docs/walls.md) the point is at a
-definite abscissa as the pose of its first sighting sees it.
+definite abscissa in the view from the pose of its first observation.
 """
 
 from __future__ import annotations

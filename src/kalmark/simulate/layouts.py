@@ -46,7 +46,7 @@ Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)
 
 @dataclass(frozen=True, eq=False)
 class Scenery:
-    """What there is to see: points (N, 2|3), segments (S, 6) from end to end, tags (T, 7) as poses, in m.
+    """The landmarks of a world: points (N, 2|3), segments (S, 6) from end to end, tags (T, 7) as poses, in m.
 
     In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags.  `planes` have textures,
     for cameras whose images are rendered.
@@ -122,7 +122,7 @@ class Loop(OfPoints):
 
     type: Literal["loop"] = "loop"
     count: Count = 20
-    """How many landmarks."""
+    """Number of landmarks."""
     radius_m: Positive = 10.0
     """The circle's radius."""
     x_m: Number = 0.0
@@ -158,7 +158,7 @@ class RandomField(OfPoints):
 
     type: Literal["random_field"] = "random_field"
     count: Count = 100
-    """How many landmarks."""
+    """Number of landmarks."""
     size_m: Positive = 50.0
     """Side of the square; its south-western corner is the origin."""
 
@@ -216,7 +216,7 @@ class RandomBox(OfPoints):
 
     type: Literal["random_box"] = "random_box"
     count: Count = 100
-    """How many landmarks."""
+    """Number of landmarks."""
     min_m: Triple = (0.0, 0.0, 0.0)
     """Lowest corner (x, y, z)."""
     max_m: Triple = (20.0, 20.0, 4.0)

@@ -1,4 +1,4 @@
-"""Images of textured planes as a camera with any lens sees them: exact poses, exact depth at any pixel.
+"""Images of textured planes by a camera with any lens: exact poses, exact depth at any pixel.
 
 A pixel's ray meets each plane at one point; the nearest one counts.  Its grey value is interpolated between the pixels
 of the texture and between two halvings of it (Williams 1983), so that distant texture does not flicker.

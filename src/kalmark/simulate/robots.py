@@ -1,7 +1,7 @@
 """Move robots through a world and let them measure, with the models the filter uses.  [S] 4.1; [TB] SimRob, SimSen.
 
 The guide and the toolbox disturb the *estimator's* control and let the robot move exactly (`noise_on: control`); with
-`noise_on: robot` the robot is disturbed and the log holds what it was told.  Either way the log holds the control
+`noise_on: robot` the robot is disturbed and the log holds the command.  Either way the log holds the control
 the estimator is given.  A diffusion always disturbs the robot.  A mount with sigmas truly sits elsewhere: the log's
 rig is the one configured, and where the sensor sits is drawn around it.  So are the constants of a motion with sigmas:
 biases, scales, radii.
@@ -105,7 +105,7 @@ class SimRobot:
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A simulated log, and what only the simulator knows.
+    """A simulated log and its truth.
 
     `states` are the true states (steps + 1, n) of each robot, `mounts` where its sensors truly sit, `origins` (by time,
     robot and sensor) what each observation of a scan is really of: an id, or None for a false one; `constants` (c,)
@@ -137,7 +137,7 @@ def simulate(world: World, seed: int | SeedSequence | Generator = 0) -> Log:
 
 
 def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simulation:
-    """Return one simulated run: its log, and what the log does not tell."""
+    """Return one simulated run: its log and its truth."""
     chance = Chance(seed)
     scenery = world.world.scenery(chance.layout)
     things = things_in(world, scenery, chance.layout)
@@ -323,8 +323,8 @@ def scans(
         y = sights.noisy(sensor, sighted.e, chance.sight)
         kept = sights.possible(sensor, y)
         if len(kept):
-            told = [sighted.ids[i] for i in kept] if world.ids else None
-            scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=told)
+            ids = [sighted.ids[i] for i in kept] if world.ids else None
+            scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=ids)
             carried.last = k, robot.pose.copy()
             found.append((scan, tuple(real[i] for i in kept)))
     return found
@@ -426,7 +426,7 @@ def seen_by(
 ) -> Sighted:  # fmt: skip
     """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last.
 
-    `velocity` is that of a sensor that sees it, in its frame, of others empty.
+    `velocity` is that of a sensor that measures it, in its frame, of others empty.
     """
     near = things.near(T[: world.dimensions], range_limit(sensor))
     v = in_frame(things.sort, T, things.values[near])

@@ -41,14 +41,14 @@ _TRIES = 200  # places drawn for a false measurement before it is given up
 
 
 def looks_for(sensor: Any) -> str:
-    """Return what a sensor sees: points, segments or tags."""
+    """Return the sort of landmarks of a sensor: points, segments or tags."""
     return {"Segments": SEGMENTS, "Wall": SEGMENTS, "TagPose": TAGS, "TagCorners": TAGS}.get(
         type(sensor).__name__, POINTS
     )
 
 
 class Sighted(NamedTuple):
-    """What a sensor sees: things v (K, n) in its frame, exact measurements e (K, m), sizes of tags (K,), and ids."""
+    """Observable landmarks of a sensor: v (K, n) in its frame, measurements e (K, m), sizes of tags (K,), and ids."""
 
     v: Array
     e: Array
@@ -57,18 +57,18 @@ class Sighted(NamedTuple):
 
 
 class SimulatedSensing(Section):
-    """How a simulated sensor departs from its model: a slower rate, and faults."""
+    """Deviations of a simulated sensor from its model: a slower rate, and faults."""
 
     every: Annotated[int, Field(ge=1)] | None = None
-    """A scan at every so manieth step: at every one, or as the sensor's `preset` says."""
+    """A scan at every so manieth step: at every one, or that of the sensor's `preset`."""
     first: Annotated[int, Field(ge=1)] | None = None
-    """The first step with a scan; if absent the one that `every` says."""
+    """The first step with a scan; if absent the one of `every`."""
     beams: Annotated[int, Field(ge=3)] = 541
     """Beams of a scan, where the sensor has the detector of a laser: then its scans are raw."""
     beams_fov_deg: Annotated[float, Field(gt=0, le=360)] = 270.0
     """Angle between the first and the last of them."""
     images: bool = False
-    """A camera in a world of textures: give its images instead of what it sees."""
+    """A camera in a world of textures: give its images instead of measurements."""
     depth: bool = False
     """With the depth of every pixel."""
     noise_grey: NotNegative = 2.0
@@ -76,9 +76,9 @@ class SimulatedSensing(Section):
     blur_px: NotNegative = 0.5
     """Blur of the images: standard deviation of a Gaussian."""
     dropouts: Share | None = None
-    """Probability that something seen is not reported: 0, or as the sensor's `preset` says."""
+    """Probability that a visible landmark is not reported: 0, or that of the sensor's `preset`."""
     outliers: Share = 0.0
-    """Probability that a measurement is false: of a place drawn from all that the sensor sees."""
+    """Probability that a measurement is false: of a place drawn from its field of view."""
     loop_reach_m: Annotated[float, Field(gt=0)] | None = None
     """An `odometer` that keeps poses: read a scan against an earlier one, too, if the robot is so near to it again."""
     swapped: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
@@ -183,7 +183,7 @@ def in_frame(sort: str, T: Array, values: Array) -> Array:
 
 
 def exact(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
-    """Return which things v (K, n) of the sensor's frame it sees, and what it would measure (K, m) without noise."""
+    """Return which v (K, n) in the sensor's frame are observable, and their measurements (K, m) without noise."""
     sort = looks_for(sensor)
     if sort == SEGMENTS:
         seen: tuple[Flags, Array] = sensor.sees_segments(HERE[v.shape[1] // 2], *halves(v))
@@ -260,14 +260,14 @@ def faulty(
     kept = rng.random(len(ids)) >= (sensing.dropouts or 0.0)
     swapped: dict[Id, Id] = dict([*sensing.swapped, *((b, a) for a, b in sensing.swapped)])
     rows = [i for i, name in enumerate(ids) if kept[i] and name not in sensing.hidden]
-    told = [swapped.get(ids[i], ids[i]) for i in rows]
-    return Sighted(v[rows], e[rows], sizes[rows], told), [real[i] for i in rows]
+    reported = [swapped.get(ids[i], ids[i]) for i in rows]
+    return Sighted(v[rows], e[rows], sizes[rows], reported), [real[i] for i in rows]
 
 
 def elsewhere(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generator) -> tuple[Flags, Array]:
     """Return false measurements (K, m): of the same things at places drawn from the field of view, and which succeeded.
 
-    Places are uniform in the volume that the sensor sees within reach: in an image, uniform over its pixels.
+    Places are uniform in the field of view within reach: in an image, uniform over its pixels.
     """
     sort, plane = looks_for(sensor), world_of(sensor) == "plane"
     found, e = np.zeros(len(v), dtype=np.bool_), np.full((len(v), len(sensor.columns)), np.nan)
@@ -295,7 +295,7 @@ def in_ball(count: int, dimensions: int, radius: float, rng: Generator) -> Array
 
 
 def tags_seen(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
-    """Return which tags at v (K, 7) a sensor sees: those that face it, with all corners in its image; and e (K, m)."""
+    """Return which tags at v (K, 7) are observable: those that face it, with all corners in its image; and e (K, m)."""
     axis = np.array([matrix(q)[:, 2] for q in np.ascontiguousarray(v[:, 3:])]).reshape(-1, 3)
     inside: Flags = np.einsum("ki,ki->k", axis, v[:, :3]) > 0
     if len(sensor.columns) == 7:

@@ -37,13 +37,13 @@ IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types o
 
 class _Underway(Section):
     route: Route
-    """Where it is told to go."""
+    """Its commanded path."""
     sensing: dict[str, SimulatedSensing] = Field(default_factory=dict)
     """By a sensor's name: its rate, and what is wrong with it."""
 
     @model_validator(mode="after")
     def _all_fits(self) -> Self:
-        """Refuse a constant control of another motion, and what is said of a sensor that the robot does not have."""
+        """Refuse a constant control of another motion, and settings of a sensor that the robot does not have."""
         robot: Any = self
         size, route = len(model_of(robot.motion).columns), self.route
         if isinstance(route, Constant) and len(route.u) != size:
@@ -96,7 +96,7 @@ class World(OfFile):
     noise_on: Literal["control", "robot"] = "control"
     """Disturb the control that the filter is given, or the robot."""
     ids: bool = True
-    """Tell the filter which landmark is which."""
+    """Give the filter the ids of the landmarks."""
     new_per_step: Count | None = None
     """At most so many landmarks are seen for the first time in a scan."""
     max_per_scan: Count | None = None
@@ -150,7 +150,7 @@ class World(OfFile):
         return validate(self._laid_over(values), Config)
 
     def models(self) -> Config:
-        """Return the configuration of what is simulated, whatever the filter believes."""
+        """Return the configuration of the simulated models, which may differ from the filter's."""
         return validate(Tree(values=self._values()), Config)
 
     def _values(self) -> dict[str, Any]:

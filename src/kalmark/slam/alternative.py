@@ -1,9 +1,9 @@
 """The other explanation of readings that do not fit: that the robot is elsewhere than the map has it.
 
 Where readings have placed a robot, some that do not fit are wrong, as those of a receiver that jumps, or the robot is
-lost: its wheels slipped, it was carried away, its inertial unit was wrong for a second.  One reading does not tell
-which.  So a second filter of the robot alone begins at it, more uncertain than it takes for that reading to fit.  It
-moves by the same controls and is corrected by the same readings of the state.  A receiver that jumps comes back, and
+lost: its wheels slipped, it was carried away, its inertial unit was wrong for a second.  One reading does not
+decide that.  So a second filter of the robot alone begins at it, more uncertain than it takes for that reading to fit.
+It moves by the same controls and is corrected by the same readings of the state.  A receiver that jumps comes back, and
 readings fit the map again.  If they fit the alternative for longer than receivers usually are wrong, it is right.
 """
 
@@ -42,7 +42,7 @@ class Alternative:
 
     @classmethod
     def of(cls, map_: Map, moving: Moving, blocks: int, since_ns: int) -> Alternative:
-        """Return what a map with so many blocks that are no landmarks, its first, says now."""
+        """Return the present state of the first so many blocks of a map, which are no landmarks."""
         own, slots = StochasticMap(), range(blocks)
         for slot, space in enumerate(map_.spaces[:blocks]):
             assert space is not None

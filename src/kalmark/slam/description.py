@@ -32,7 +32,7 @@ STATES = {
         "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
     ),
 }  # fmt: skip
-"""What a state may have behind its pose, as keys of a start."""
+"""Components of a state after its pose, as keys of a start."""
 SIGMAS = {
     "plane": (("sigma_xy_m", 0), ("sigma_xy_m", 1), ("sigma_theta_rad", 0)),
     "space": (*(("sigma_position_m", k) for k in range(3)), *(("sigma_rotation_deg", k) for k in range(3))),
@@ -116,7 +116,7 @@ def describe_place(at: Any, world: str, cov: Any = None, behind: tuple[str, ...]
 
 
 def state_of(said: Mapping[str, Any], behind: tuple[str, ...]) -> list[float]:
-    """Return what a start says of a state behind its pose; empty if it says nothing."""
+    """Return the components of a start's state after its pose; empty if it has none."""
     names = known(behind, world_of(said))
     return [said[name] for name in names] if said.get("state") is None else [*said["state"]]
 

@@ -40,12 +40,12 @@ class Estimate:
 
     @property
     def association(self) -> Association:
-        """What decides which landmark was observed, where a mount has none of its own."""
+        """The data association, where a mount has none of its own."""
         return self.state.settings.association
 
     @property
     def estimator(self) -> Estimator:
-        """How the map is predicted and corrected."""
+        """The estimator of the map: prediction and correction."""
         return self.state.estimator
 
     @property
@@ -75,7 +75,7 @@ class Estimate:
     def covariance(self, *names: Id) -> Array:
         """Return the joint covariance (n, n) of robots and landmarks, in the given order, in standard coordinates."""
         if not names:
-            raise MapError("covariance of nothing was asked for, expected names of robots or landmarks")
+            raise MapError("covariance of no blocks, expected names of robots or landmarks")
         known = self.tracks.known
         slots = [self.slot(name) for name in names if name not in known]
         P = self.map.covariance(slots) if slots else np.zeros((0, 0))
@@ -149,8 +149,8 @@ class Estimate:
     def place(self, name: Id) -> tuple[Array, Array]:
         """Return where a robot or a landmark is: mean (2 or 3,) and covariance, m and m^2, in the map's frame.
 
-        A landmark's model says where it is (`HasPlace`); of a line it is its point nearest to the anchor or the origin.
-        Raises MapError for a landmark whose model does not say where it is.
+        A landmark's model gives its position (`HasPlace`); of a line it is its point nearest to the anchor or the origin.
+        Raises MapError for a landmark whose model has no position.
         """
         mean, P, model = self.mean(name), self.covariance(name), self.landmark_model(name)
         if model is None:
@@ -158,12 +158,12 @@ class Estimate:
             return mean[:d], P[:d, :d]
         placed = place_of(model, mean[None])
         if placed is None:
-            raise MapError(f"{name!r} is a {model.kind}, which does not say where it is, expected a model with place()")
+            raise MapError(f"{name!r} is a {model.kind}, which has no position, expected a model with place()")
         (p,), (P_l,) = placed
         return p, P_l @ P @ P_l.T
 
     def lags(self, robot: str) -> bool:
-        """Return whether a robot is still where it was before the last event: nothing has asked for it yet."""
+        """Return whether the pose of a robot is still that before the last event: nothing has read it since."""
         return self.state.moving[robot].held.lags(self.t_ns or 0)
 
     def landmark_model(self, name: Id) -> Landmark | None:

@@ -1,4 +1,4 @@
-"""Gaps in the controls: noticed by their intervals, bridged by the motion that the robot was capable of meanwhile.
+"""Gaps in the controls: detected by their intervals, bridged by the motion that the robot was capable of meanwhile.
 
 A control is late if it comes after more than `TIMES` the longest interval that is usual.  In a gap the motion of the
 robot is unknown: its position is anywhere within the distance that its greatest speed allows, its heading turned by
@@ -22,10 +22,10 @@ from kalmark.report import Gap
 
 ACTIONS = ("refuse", "widen", "ignore")
 TIMES = 5
-RECENT = 1000  # intervals that tell what is usual,
+RECENT = 1000  # intervals from which the usual one is found,
 RANK = 5  # of which the longest four may be gaps
 HELD_NS = 2_000_000_000  # a velocity or a steering angle may well be held so long
-LEARNED = 20  # controls from one look at them to the next, and before the first
+LEARNED = 20  # controls from one update of the usual interval to the next, and before the first
 MARGIN = 1.2  # greatest speed over the greatest one in the log so far
 NEVER_NS = 2**62
 WHOLE = 1.5  # an increment at least so much larger than any before is of the whole gap: its odometry went on
@@ -33,7 +33,7 @@ RULED_OUT = 1.5  # times the limits of the robot: no such motion, but a jump of 
 
 
 class Gaps:
-    """Watches the controls of one robot, learns what is usual of them, and answers how far it may have moved.
+    """Detector of gaps in the controls of one robot, by their usual intervals, and bound of its motion in them.
 
     `max_speed_mps` and `max_turn_radps` are its limits; None: `MARGIN` times the largest so far.
     """
@@ -70,7 +70,7 @@ class Gaps:
             self.late_ns = min(self.late_ns, self.since_ns)
 
     def take(self, control: Control) -> None:
-        """Learn from a control, which ends a gap."""
+        """Count the interval of a control, which ends a gap."""
         if self.last_ns is not None:
             self.pending = (*self.pending, (control.t_ns - self.last_ns, control.u))
             if len(self.pending) == LEARNED:
@@ -78,7 +78,7 @@ class Gaps:
         self._go_on(control.t_ns)
 
     def forget(self) -> None:
-        """Forget the last control, and not what is usual: how the robot came to the next one is left open."""
+        """Drop the last control, but keep the usual interval: the motion until the next one is unknown."""
         self.last_ns, self.since_ns, self.left_out_ns, self.late_ns = None, None, None, NEVER_NS
 
     def _go_on(self, t_ns: int) -> None:

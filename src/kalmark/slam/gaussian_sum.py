@@ -1,7 +1,7 @@
 """A Gaussian sum: the pose of a robot as several Gaussians, where one cannot describe it.  Alspach and Sorenson 1972.
 
-With an unknown heading a robot may be anywhere on a circle after its first metre; a range to a known beacon says that
-it is on another one.  No linearisation holds on either (`tracks/linearity.py`).  So the Gaussian is split along the
+With an unknown heading a robot may be anywhere on a circle after its first metre; a range to a known beacon puts it on
+another one.  No linearisation holds on either (`tracks/linearity.py`).  So the Gaussian is split along the
 axis that bends, each part is corrected alone, and its likelihood is its weight:
 
     heading:    N(theta) = sum of w_i N(theta_i, PIECE_RAD), the position turned about the place where the heading began
@@ -91,7 +91,7 @@ class GaussianSum:
 
     @classmethod
     def of(cls, map_: Map, moving: Moving, blocks: int, t_ns: int, gate: float) -> GaussianSum:
-        """Return what a map with so many blocks that are no landmarks says of a robot now, as one part."""
+        """Return the Gaussian of a robot in a map with so many blocks that are no landmarks, as one part."""
         first, second = (Alternative.of(map_, moving, blocks, t_ns) for _ in range(2))
         return cls(first, [second], np.zeros(1), -0.25 * gate)
 
@@ -173,7 +173,7 @@ class GaussianSum:
         return float(np.logaddexp(_log_sum(self.log_weights), self.prior_log))
 
     def _prune(self) -> None:
-        """Give up the parts without weight, and make one of those that are alike."""
+        """Remove the parts without weight, and merge those that are alike."""
         keep = np.argsort(-self.log_weights, kind="stable")[:MOST]
         keep = keep[self.log_weights[keep] > self.log_weights.max(initial=-math.inf) + math.log(LEAST)]
         self.parts, self.log_weights = [self.parts[i] for i in keep.tolist()], self.log_weights[keep]

@@ -46,9 +46,9 @@ MOST, CHANGED = 30, 4.0  # controls in their mean, and sigmas by which noise alo
 class MotionPart(NamedTuple):
     """One piece of motion: the control, the covariance N of its error, and its duration.
 
-    `first` and `last` say whether it begins and ends its control's interval: if not both, the error is shared.
+    `first` and `last`: whether it begins and ends its control's interval: if not both, the error is shared.
     `unknown` (dof, dof) is the covariance of what the robot may have moved besides, without a control.  `usual` is the
-    control as earlier ones tell it, None where no constants of controls are in the map.
+    mean of earlier controls like it, None where no constants of controls are in the map.
     """
 
     u: Array
@@ -98,7 +98,7 @@ class HeldInput:
     t_ns: int | None
     u: Array | None
     N: Array | None
-    usual: Array | None  # as earlier controls tell it,
+    usual: Array | None  # of earlier controls,
     mean: RateMean | None  # which is their mean
     fresh: bool
     gaps: Gaps | None
@@ -135,7 +135,7 @@ class HeldInput:
         return np.full(len(self.motion.columns), np.nan) if self.u is None else self.u
 
     def stays(self, to_ns: int) -> bool:
-        """Return whether the robot is at that time where it was, and nothing is to be told of a gap."""
+        """Return whether the robot is at that time where it was, and no gap is to be reported."""
         gaps = self.gaps
         on_time = gaps is None or (to_ns <= gaps.late_ns and gaps.noticed is None)
         return on_time and not (self.motion.held or self.coasts)
@@ -164,7 +164,7 @@ class HeldInput:
         return MotionPart(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)
 
     def noticed(self) -> tuple[Gap, ...]:
-        """Return the gap that was noticed since the last question, if any."""
+        """Return the gap that was detected since the last call, if any."""
         if self.gaps is None or self.gaps.noticed is None:
             return ()
         gap, self.gaps.noticed = self.gaps.noticed, None
@@ -186,7 +186,7 @@ class HeldInput:
             self.gaps.adrift = False
 
     def lags(self, t_ns: int) -> bool:
-        """Return whether a robot is still where it was before a time: nothing has asked for it yet."""
+        """Return whether the pose of a robot is still that before a time: nothing has read it since."""
         moves = self.coasts or self.u is not None
         return moves and self.t_ns is not None and t_ns > self.t_ns
 
@@ -219,7 +219,7 @@ class HeldInput:
         return closing if part is None else [part, *closing]
 
     def _usual(self, u: Array, N: Array, dt_s: float) -> Array | None:
-        """Return a control u (k,) as those before tell it, and take it into their mean; itself where it has changed."""
+        """Return the mean (k,) of earlier controls like u, and take u into it; u itself where it has changed."""
         if not self.calibrates or dt_s <= 0.0:
             return None
         rate, before = u / dt_s, self.mean

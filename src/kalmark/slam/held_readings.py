@@ -1,10 +1,10 @@
-"""Measurements that a sensor gives again, as a receiver does that repeats its last one until it has a new one.
+"""Repeated measurements, as of a receiver that repeats its last one until it has a new one.
 
 A measurement that has the numbers of the one before to the last bit, though its robot has moved by its controls since,
-is that one: noise forbids it, unless the numbers are so coarse that they repeat by chance.  How likely that is, the
-sensor tells by its own measurements: the least difference q of successive ones is a step of their numbers, and noise of
-which differences have the geometric mean g repeats a number with the probability CHANCE q / g.  Numbers that repeat
-alone, while others of the same measurement change, do so by chance as often as they did.
+is that one: noise forbids it, unless the numbers are so coarse that they repeat by chance.  Its probability is
+estimated from the sensor's own measurements: the least difference q of successive ones is a step of their numbers, and
+noise of which differences have the geometric mean g repeats a number with the probability CHANCE q / g.  Numbers that
+repeat alone, while others of the same measurement change, do so by chance as often as they did.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def again(report: Report, ids: Sequence[Id | None], p: int, of: Id | None = None
 
 @dataclass
 class LastMeasurement:
-    """What a sensor gave last, y (K, m) with its ids, and what its measurements have told of their numbers.
+    """The last measurement of a sensor, y (K, m) with its ids, and statistics of its numbers.
 
     Of each column: the `least` difference of successive measurements (0 of none), the sum of the logarithms of
     differences, and how many `differ` and are `equal`.  `went` and `doubt` (c,) are the controls since it was given and
@@ -58,7 +58,7 @@ class LastMeasurement:
 
     @classmethod
     def of(cls, y: Array, ids: tuple[Id | None, ...] | None) -> LastMeasurement:
-        """Return what a first measurement tells."""
+        """Return the record of a first measurement."""
         m = y.shape[1]
         return cls(y, ids, *np.zeros((4, m)))
 

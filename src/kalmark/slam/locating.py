@@ -1,7 +1,7 @@
 """A robot that may be anywhere: put where its scan fits the map, at a global start and after a gap, or a Gaussian sum.
 
-A sensor that finds places determines a pose by one scan of known landmarks (`association/global_start.py`).  What says
-less, a range, a strength or a bearing with an id, corrects a Gaussian sum of poses, from the first one whose
+A sensor that finds places determines a pose by one scan of known landmarks (`association/global_start.py`).  A weaker
+measurement, a range, a strength or a bearing with an id, corrects a Gaussian sum of poses, from the first one whose
 linearisation does not hold over the robot's covariance until it holds over that of the sum.
 """
 
@@ -37,7 +37,7 @@ from kalmark.tracks.surveys import SURVEYED
 
 UNNAMED = "the pose of its robot is not known yet, and it has no id of a known landmark"
 ONE = "from an unknown place it takes two known landmarks, expected a second one or a start with a smaller sigma_xy_m"
-DIRECTION = "it tells no distance from an unknown place, expected ranges beside it or a start with a smaller sigma_xy_m"
+DIRECTION = "it determines no distance from an unknown place, expected ranges too or a start with a smaller sigma_xy_m"
 
 
 def started(state: State, scan: ScanContext, query: Query) -> Located | None:
@@ -146,7 +146,7 @@ def _gate(scan: ScanContext) -> float:
 def _seen(state: State, scan: ScanContext, map_: Map) -> list[tuple[int, KnownObservation]]:
     """Return the observations of landmarks that are known, with their numbers, as those of a robot in a map alone.
 
-    The covariance of a survey is noise: what it says of the survey is left alone.
+    The covariance of a survey is noise: the survey is not corrected.
     """
     tracks, channel, out = state.tracks, scan.channel, list[tuple[int, KnownObservation]]()
     for k, name in enumerate(scan.ids):
@@ -206,7 +206,7 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
 def decided(
     state: State, scan: ScanContext, query: Query, decide: Callable[[Query], Sequence[Decision]]
 ) -> tuple[Query, Sequence[Decision]]:
-    """Return what was asked and the decisions on a scan; a robot adrift is moved first.
+    """Return the query and the decisions on a scan; a robot adrift is moved first.
 
     It is moved to where its scan fits, and stays there if the association recognises a landmark from there.
     """
@@ -247,7 +247,7 @@ def placed_again(state: State, channel: Channel, name: str, T: Array, cov: Array
 
 
 def widened(state: State, name: str, landmarks: Sequence[Id], factor: float) -> None:
-    """Multiply the joint covariance of a robot and of landmarks by a factor: they have drifted by more than it says."""
+    """Multiply the joint covariance of a robot and of landmarks by a factor: their drift is larger than that."""
     slots = [state.moving[name].slot, *state.tracks.slots_of(landmarks).tolist()]
     rows = np.concatenate([state.map.index(slot) for slot in slots])
     state.map.predict(rows, math.sqrt(factor) * np.eye(len(rows)), np.zeros((len(rows), len(rows))))
@@ -256,7 +256,7 @@ def widened(state: State, name: str, landmarks: Sequence[Id], factor: float) -> 
 def _put(state: State, scan: ScanContext, T: Array) -> None:
     """Move a robot of the plane so that the sensor of a scan is at T (3,).
 
-    Its mean alone: the covariance says that it may be there.
+    Its mean alone: its covariance includes that pose.
     """
     r = state.map.mean(scan.robot)
     pose = compose(T, compose(inverse(scan.pose())[0], r[:3])[0])[0]

@@ -20,10 +20,10 @@ from kalmark.tracks.scan import ScanContext
 
 
 def review(state: State, scan: ScanContext, policy: Policy, seen: Sequence[Observation]) -> None:
-    """Simplify and extend the landmarks of a scan, and give up those that are expected and not found.  [TB] 4.4."""
+    """Simplify and extend the landmarks of a scan, and remove those that are expected and not found.  [TB] 4.4."""
     fused = [(o, state.tracks.confirmed[o.landmark]) for o in seen
              if o.outcome == "associated" and o.landmark in state.tracks.confirmed]  # fmt: skip
-    models = {id(track.model): track.model for _, track in fused}  # few: to ask each track takes long
+    models = {id(track.model): track.model for _, track in fused}  # few: a test of each track takes long
     simpler = {key for key, model in models.items() if policy.linear and isinstance(model, Reparametrizable)}
     for _, track in fused if simpler else ():
         if id(track.model) not in simpler:
@@ -69,7 +69,7 @@ def _give_up(state: State, scan: ScanContext, policy: Policy, found: dict[Id | N
 
 
 def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
-    """Map management after a scan: landmarks that are gone, that are one, tentative ones without hope."""
+    """Map management after a scan: removal of landmarks that are gone, merging, deletion of tentative ones."""
     report, ids = scan.report, scan.event.ids
     for name in state.surveys.wrong() if state.surveys.misfits and not state.sums else ():  # else it may be the robot
         state.remove(name)

@@ -36,7 +36,7 @@ from kalmark.tracks.channel import Channel, default_landmark
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """What is decided about the scans of a channel.
+    """Settings for the scans of a channel.
 
     `deferred` starts landmarks with ids from several measurements, `delayed` any landmark from cloned poses (None: at
     first sight).  `starts` are the answers to an observation without an id that start one.  `averages`: the association
@@ -152,7 +152,7 @@ def channel_of(
 
 
 def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:
-    """Refuse what lives in the plane among robots that move in space, and the other way round."""
+    """Refuse models of the plane among robots that move in space, and models of space among those of the plane."""
     here = next(iter(robots.values())).motion.space.world
     if world and world != here:
         raise ModelError(f"{what} is of the {world}, expected one of the {here}, where the first robot moves")

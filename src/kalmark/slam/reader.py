@@ -22,8 +22,8 @@ from kalmark.slam.checks import measurements
 from kalmark.slam.held_control import Moving, RateMean
 from kalmark.slam.rests import Standing
 
-POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of what measures where an antenna is
-LEAST_S = 1e-6  # between two readings that tell how the robot moved
+POSITIONS = ("x_m", "y_m"), ("x_m", "y_m", "z_m")  # columns of sensors of an antenna's position
+LEAST_S = 1e-6  # between two readings that determine a motion
 
 
 def _time(event: Scan, k: int) -> int:
@@ -40,13 +40,13 @@ class StateReader:
 
     `counts`: what it measures counts from its last scan, where a clone of the robot's pose was left, or, by an id that
     is its time, from another of the last `keep`, or of those that it has to `foresee` where that is 0.  `standing`
-    notices of a `zero_velocity` that its robot stands.
-    `is_position`: as a fix it says where a lost robot is.
+    is the detector of rest of a `zero_velocity`.
+    `is_position`: like a fix it determines where a lost robot is.
     """
 
     t_ns: int | None  # of its last reading
     standing: Standing | None
-    mean: RateMean | None  # of its readings, where its scale is estimated of what the robot's controls say,
+    mean: RateMean | None  # of its readings, where its scale is estimated from the robot's controls,
     sigma: Array  # and what the last was uncertain by, as a rate
     until: dict[int, int] | None  # of a scan that readings of a log count from, the time of the last
 
@@ -72,7 +72,7 @@ class StateReader:
 
     @property
     def view(self) -> Any:
-        """What `linearize` takes; made when it is first needed, as compiled code is."""
+        """The view for `linearize`; made when it is first needed, as compiled code is."""
         if self._view is None:
             self._view = state_view_of(self.sensor, self.motion, self.at)
         return self._view
@@ -120,7 +120,7 @@ class StateReader:
         return [number for from_ns, number in clones.items() if self.until.get(from_ns, t_ns) > t_ns]
 
     def is_loop(self, event: Scan, k: int) -> bool:
-        """Return whether a row of a scan says by its id from which earlier one it counts."""
+        """Return whether a row of a scan names by its id the earlier one from which it counts."""
         return event.ids is not None and event.ids[k] not in (None, event.robot)
 
     def constants(self, map_: Map) -> tuple[Array, Array] | None:
@@ -156,7 +156,7 @@ class StateReader:
         return [moving.held.in_force[None]] if self.of_state and isinstance(self.motion, HoldsRate) else []
 
     def _usual(self, y: Array, since_s: float) -> list[Array]:
-        """Return a reading y (1, m) as the ones before tell it; none where it has changed, or none is needed."""
+        """Return the mean (1, m) of earlier readings like y; none where y has changed, or none is needed."""
         unit_s = since_s if self.sensor.views == CHANGE else 1.0
         if self.mean is None or self.mean.after(y[0] / unit_s, self.sigma).number == 1:
             return []

@@ -1,16 +1,16 @@
-"""A robot that is elsewhere than the filter believes, placed again by fixes that agree with each other.
+"""Relocation of a robot by fixes that agree with each other and do not fit its estimated pose.
 
 Fixes are positions of the robot, or those of an antenna on it, which a sensor of the state measures.
 
 A fix outside its gate is left out.  A filter that has lost its robot would leave out all of them.  So the last fixes
-that were left out, one after the other, are compared with where the filter believed the robot to be: if a shift and a
+that were left out, one after the other, are compared with the estimated positions of the robot: if a shift and a
 turn about the vertical axis lead from there to all of them, within their noise, the robot is moved by it, or,
 where fixes have fitted before, an `alternative` begins there.  What that does not determine, and all correlation of the
-robot with the map, is given up.
+robot with the map, is dropped.
 
-If nothing has said yet where the map is in the world, no survey and fewer fixes that fitted than must agree, it was the
-start that was wrong: then the whole map is moved with the robot.  Its covariance gets that of the shift and of the
-turn, which all of it shares.
+If nothing has determined yet where the map is in the world, no survey and fewer fixes that fitted than must agree, it
+was the start that was wrong: then the whole map is moved with the robot.  Its covariance gets that of the shift and of
+the turn, which all of it shares.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from kalmark.geometry.spaces import ANCHOR, VECTOR, VECTOR3, Space
 from kalmark.tracks.linearity import TURN_RAD
 
 NEEDED, KEPT = 5, 30  # fixes that must agree, and the last so many that are compared
-SHARE = 0.999  # of agreeing fixes that are believed
+SHARE = 0.999  # of agreeing fixes that are accepted
 LOOSE = 2.0  # sigmas of a fix, for what the robot's motion adds between the fixes
 
 
 class RejectedFix(NamedTuple):
-    """A fix y (d,) with covariance R (d, d) that was left out when the filter believed what it is of at p (d,)."""
+    """A fix y (d,) with covariance R (d, d) that was left out when the estimate of what it measures was p (d,)."""
 
     y: Array
     R: Array
@@ -62,7 +62,7 @@ class Replaced(NamedTuple):
 
 
 def replaced(pose: Array, P: Array, left_out: Sequence[RejectedFix]) -> Replaced | None:
-    """Return where a robot is that is believed at `pose`, with the covariance P; None where fixes do not tell."""
+    """Return the new pose of a robot estimated at `pose` with covariance P; None where fixes do not determine it."""
     if len(left_out) < NEEDED:
         return None
     y, p = (np.array([getattr(one, name) for one in left_out]) for name in ("y", "p"))

@@ -1,4 +1,4 @@
-"""A robot that stands still, noticed from its controls and from the readings of its sensors: zero-velocity updates.
+"""Zero-velocity updates: detection of a standing robot from its controls and the readings of its sensors.
 
 Windows of `window_s` follow each other.  In each the controls and the readings of gyroscopes, speeds, second odometries
 and accelerometers are compared with those of a robot that stands:
@@ -84,7 +84,7 @@ class Source:
         self.readings.append((y[self.at] * scale, np.diagonal(R)[self.at] * scale**2))
 
     def means(self, constants: Constants) -> list[WindowMean]:
-        """Return what the readings of this window say, less what a robot that stands is expected to read."""
+        """Return the means of the readings of this window, less those expected of a robot that stands."""
         z, s2 = (np.array(column) for column in zip(*self.readings, strict=True))
         bias, variance = self._expected(constants)
         w = 1.0 / np.maximum(s2, TINY)
@@ -96,7 +96,7 @@ class Source:
     def _expected(self, constants: Constants) -> tuple[Array, Array]:
         """Return what a robot that stands is expected to read (c,), by the sensor's constants, and the variances (c,).
 
-        What an accelerometer reads then is not known.
+        The expected reading of an accelerometer is not known then.
         """
         nothing, sensor = np.zeros(len(self.at)), self.sensor
         if sensor is None or sensor.views != TWIST:
@@ -110,9 +110,9 @@ class Source:
 
 
 def standing_of(sensor: Any, robot: Robot) -> Standing | None:
-    """Return what notices for a sensor that its robot stands, None if it is another sensor.
+    """Return the detector of rest of a `zero_velocity` sensor, None if it is another sensor.
 
-    Raises ModelError if nothing of the robot tells, or if two of its sensors would notice.
+    Raises ModelError if the robot has no input to it, or two such sensors.
     """
     if not isinstance(sensor, ZERO):
         return None
@@ -122,7 +122,7 @@ def standing_of(sensor: Any, robot: Robot) -> Standing | None:
 
 
 class Standing:
-    """Notices that a robot stands, window by window; `sensor` says how sure that must be."""
+    """Detector of a robot that stands, window by window; `sensor` has the thresholds."""
 
     began_ns: int | None
     sources: dict[str, Source]
@@ -133,8 +133,8 @@ class Standing:
         watched = {column for source in self.sources.values() for column in source.columns}
         if not (watched & ALONG and watched & TURNS):
             raise ModelError(
-                f"robot {robot.name!r}: nothing tells a {type(sensor).__name__} speed and turn rate, expected controls "
-                "or sensors, such as speed and gyro, that do"
+                f"robot {robot.name!r}: {type(sensor).__name__} has no input of speed and turn rate, expected controls "
+                "or sensors, such as speed and gyro, with these"
             )
         self.began_ns = None
         normal = NormalDist()
@@ -165,7 +165,7 @@ class Standing:
         return stood
 
     def stood(self, constants: Constants) -> bool:
-        """Return whether the robot stood in this window; a source that was silent does not say so."""
+        """Return whether the robot stood in this window; False if a source gave no reading."""
         if not all(source.readings for source in self.sources.values()):
             return False
         of = [source.means(partial(constants, self.robot)) for source in self.sources.values()]
@@ -189,7 +189,7 @@ class Standing:
 
 
 def sources_of(robot: Robot) -> list[Source]:
-    """Return what tells of a robot whether it stands: its controls, unless they are impulses, and its own sensors."""
+    """Return the inputs that show whether a robot stands: its controls, unless impulses, and its own sensors."""
     motion, plane = robot.motion, robot.motion.space.world == "plane"
     still, found = np.zeros((1, 3 if plane else 6)), list[tuple[str, Any, tuple[str, ...], bool]]()
     if not coasts(motion):
@@ -200,8 +200,8 @@ def sources_of(robot: Robot) -> list[Source]:
             found.append((name, own, tuple(own.columns), own.views == CHANGE))
     sources = []
     for name, sensor, columns, per_s in found:
-        wanted = SHAKEN if sensor is not None and sensor.views == POSE else ALONG | ASIDE | TURNS
-        at = [i for i, column in enumerate(columns) if column in wanted]
+        used = SHAKEN if sensor is not None and sensor.views == POSE else ALONG | ASIDE | TURNS
+        at = [i for i, column in enumerate(columns) if column in used]
         if at:
             sources.append(Source(name, sensor, tuple(columns[i] for i in at), at, still, per_s))
     return sources

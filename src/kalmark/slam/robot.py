@@ -136,8 +136,8 @@ class Mount:
 class Robot:
     """A robot: its motion model, its start with covariance `cov` (None: known exactly), its sensors.
 
-    `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.  `gaps` says
-    what to do about controls that stop: "widen" the covariance by what the robot may have moved meanwhile, at most by
+    `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.  `gaps` is
+    the action on controls that stop: "widen" the covariance by what the robot may have moved meanwhile, at most by
     these speeds (None: by the largest so far), "refuse" to go on, or "ignore" it.  Controls up to `rests_until_ns` do
     not move it: those at rest, from which its start was found.
     """

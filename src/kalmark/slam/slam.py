@@ -76,9 +76,9 @@ class Slam(Estimate):
     own) what a landmark is.  A point of unknown depth becomes Euclidean where its linearity index falls below
     `reparametrize` (None: never).  `map` is "dense", "postponed" (the compressed map, docs/compressed.md), or "auto":
     dense while small; `numbers` ("float64", "float32") are those in which a compressed one keeps what is inactive.
-    `upkeep` says when an observation without an id becomes a landmark (docs/association.md).  Events must come in the
-    order of their times, none more than `longest_pause_s` after the one before it: its stamp is wrong.  After 10 such
-    events in a row, none of them that far after the one before it, it was a pause.
+    `upkeep` decides when an observation without an id becomes a landmark (docs/association.md).  Events must come in
+    the order of their times, none more than `longest_pause_s` after the one before it: its stamp is wrong.  After 10
+    such events in a row, none of them that far after the one before it, it was a pause.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class Slam(Estimate):
             by_name[robot.name] = robot
         settings = Settings(association, estimator, landmarks, map, reparametrize, numbers, upkeep, longest_pause_s)
         super().__init__(State(by_name, settings))
-        self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may ask `expect`
+        self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may call `expect`
         self._ahead: list[int] = []  # times of the events in a row that came too far ahead
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Frame: self._frame, Fix: self._fix}
         if isinstance(estimator, CompilingEstimator):
@@ -315,7 +315,7 @@ class Slam(Estimate):
             scan.report.observations = located.fates or waits
             return
         if located is None:
-            query, decisions = locating.decided(state, scan, query, lambda asked: self._decided(policy, asked))
+            query, decisions = locating.decided(state, scan, query, lambda query: self._decided(policy, query))
         else:
             query = Query(scan)
             decisions = self._decided(policy, query, located.decisions)
@@ -343,10 +343,10 @@ class Slam(Estimate):
             found = list(seen.values())
         scan.report.observations = tuple(found)
 
-    def _decided(self, policy: Policy, query: Query, told: list[Decision] | None = None) -> Sequence[Decision]:
-        """Ask the association, unless it has `told`; where its numbers are singular, only ids say what was observed."""
+    def _decided(self, policy: Policy, query: Query, given: list[Decision] | None = None) -> Sequence[Decision]:
+        """Return the association's decisions, or those `given`; where its matrices are singular, only ids are used."""
         try:
-            decisions = policy.association.associate(query) if told is None else told
+            decisions = policy.association.associate(query) if given is None else given
             return accepted(query, decisions, policy.upkeep.odds) if policy.holds_back else decisions
         except np.linalg.LinAlgError:
             return [(None, SINGULAR) if i is None else (i, "") for i in query.ids]
@@ -389,7 +389,7 @@ class Slam(Estimate):
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance.
 
-        What is known exactly stays outside the map: no step depends on how many there are (docs/localization.md).
+        Landmarks known exactly stay outside the map: no step depends on how many there are (docs/localization.md).
         """
         state = self.state
         name = checked_id(name, "landmark")

@@ -143,7 +143,7 @@ def _defer(state: State, scan: ScanContext, way: Initialization, k: int, name: I
 
 
 def _take(state: State, scan: ScanContext, k: int, track: Track, step: Step) -> None:
-    """Do what a step of an initialiser asks for.  Raises MapError where the map is full."""
+    """Apply a step of an initialiser.  Raises MapError where the map is full."""
     pending = step.pending or track.pending
     assert pending is not None
     for correction in step.corrections:

@@ -38,7 +38,7 @@ CURE = "start anew from a pose that is less certain, or with larger sigmas of co
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """What a Slam is constructed with beside its robots, as `Slam` explains it."""
+    """Arguments of a `Slam` beside its robots, as its docstring has them."""
 
     association: Association
     estimator: Estimator
@@ -54,7 +54,7 @@ class State:
     """The map, the tracks and the clones of some robots, with the channels and readers of their sensors.
 
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
-    `standing` are, of robots that are noticed to stand, the names of the sensors that do; `alternatives` are, of robots
+    `standing` are, of robots with detection of rest, the names of the sensors that do; `alternatives` are, of robots
     whose readings do not fit, the other explanations of these; `sums` are, of robots that may be in several places,
     their poses; `taken` are the events of this very time: the kind, the robot and the sensor of each; `given` is what
     each sensor gave last.
@@ -68,7 +68,7 @@ class State:
     clones: Clones
     surveys: Surveys
     given: dict[ChannelKey, LastMeasurement]
-    placed: int  # fixes that have told where the map is in the world; a survey counts as many
+    placed: int  # fixes that have determined where the map is in the world; a survey counts as many
     moving: dict[str, Moving]
     alternatives: dict[str, Alternative]
     sums: dict[str, GaussianSum]
@@ -101,7 +101,7 @@ class State:
 
     @property
     def estimator(self) -> Estimator:
-        """How the map is predicted and corrected."""
+        """The estimator of the map: prediction and correction."""
         return self.settings.estimator
 
     def _place(self, robot: Robot, kinds: list[Landmark]) -> None:
@@ -216,7 +216,7 @@ class State:
         return True
 
     def settle(self) -> None:
-        """Let front ends know that something else than their frames changes the map."""
+        """Notify front ends that something else than their frames changes the map."""
         for front_end in self.front_ends.values():
             front_end.settle()
 

@@ -74,7 +74,7 @@ def read(state: State, event: Scan, reader: StateReader) -> Report:
 
 
 def stood(state: State, event: Event) -> Observation | None:
-    """Correct by a velocity of zero where a robot is noticed to stand at the end of an event."""
+    """Correct by a velocity of zero where a robot is detected to stand at the end of an event."""
     key = event.robot, state.standing[event.robot]
     reader = state.readers[key]
     assert reader.standing is not None
@@ -89,7 +89,7 @@ def stood(state: State, event: Event) -> Observation | None:
 
 
 def fix(state: State, event: Fix) -> Report:
-    """Correct by a position from outside; place a robot again where fixes that agree say that it is lost."""
+    """Correct by a position from outside; place a robot again where fixes that agree show that it is lost."""
     pose, size = (3, 2) if state.robots[event.robot].motion.space.axes == 1 else (7, 3)
     refuse_bad_fix(event, size)
     state.t_ns = event.t_ns
@@ -114,8 +114,8 @@ def fix(state: State, event: Fix) -> Report:
 def _believed(state: State, name: str, y: Array, R: Array, done: Correction, fits: bool) -> float:
     """Take note whether a position y (d,) of noise R (d, d) fitted; return how far, m, it moved the robot, 0 if not.
 
-    Where none has said yet where the map is, the first that agree do.  Later they may be wrong: then the robot moves
-    if they fit an alternative for long.  `fits` tells whether this one does.
+    Where none has determined yet where the map is, the first that agree do.  Later they may be wrong: then the robot
+    moves if they fit an alternative for long.  `fits`: whether this one does.
     """
     moving, other = state.moving[name], state.alternatives.get(name)
     if done.fused[0]:

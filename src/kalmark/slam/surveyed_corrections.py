@@ -34,7 +34,7 @@ def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
 
 
 def is_tried(state: State, robot: str, names: Sequence[Any]) -> bool:
-    """Return whether a scan says something of surveys: of those on trial, or of landmarks that did not fit before."""
+    """Return whether a scan tests surveys: those on trial, or landmarks that did not fit before."""
     trial = state.surveys.trial.keys()
     return bool(state.surveys.strangers.get(robot)) or (bool(trial) and not trial.isdisjoint(names))
 
@@ -76,9 +76,9 @@ def corrected(
 
 
 def _widen(state: State, scan: ScanContext, before: Array) -> None:
-    """Let the state of a robot that was elsewhere be as uncertain as it has changed now: it was believed too much.
+    """Raise the covariance of a robot that was elsewhere to the change of its state: it was too small.
 
-    What its covariance lets it move by is too little at first, but doubles from time to time.
+    The change that its covariance allows is too small at first, but doubles from time to time.
     """
     after, d, dof = state.map.mean(scan.robot), scan.dimensions, scan.channel.pose_dof
     turn = after[2] - before[2] if d == 2 else 2.0 * math.acos(min(1.0, abs(float(after[3:7] @ before[3:7]))))

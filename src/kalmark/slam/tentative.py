@@ -69,7 +69,8 @@ def compare(state: State, scan: ScanContext, policy: Policy, new: list[int], dec
 def _confirm(state: State, scan: ScanContext, track: Track) -> None:
     """Make a landmark of a tentative track, and fuse the measurements that were kept of it from their clones.
 
-    What each expects less what it measured, e - y, becomes a block of the map, which is observed to be zero.
+    The difference of expectation and measurement of each, e - y, becomes a block of the map, which is observed to be
+    zero.
     """
     del state.tracks.tentative[track.id]
     state.tracks.confirm(track)

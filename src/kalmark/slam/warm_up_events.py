@@ -109,7 +109,7 @@ def rehearse(
 def _add_landmarks(
     twin: Estimate, process: Callable[[Event], object], pose: Callable[[str, str], Array], add: Callable[..., None]
 ) -> None:  # fmt: skip
-    """Let each sensor begin landmarks where it is now, and add points where it sees such: others become points, too."""
+    """Start landmarks of each sensor at its pose, and add points of its kinds, which other landmarks may become."""
     for key, channel in [*twin.state.channels.items()]:
         scene = _Scene(twin.robots[key[0]].sensors[key[1]], pose(*key))
         with suppress(Exception):
@@ -159,7 +159,7 @@ def _merge(twin: Estimate) -> None:
 def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
     """Yield events of each robot and sensor: a few landmarks seen again and again, with ids and without, and a fix.
 
-    `pose` gives where a robot's sensor, both by name, is when it is asked, (3,) or (7,).
+    `pose` gives where a robot's sensor, both by name, is at the time of the call, (3,) or (7,).
     """
     robots, t_s = list(robots), 0.0
     mounts = {(robot.name, name): mount for robot in robots for name, mount in robot.sensors.items()}
@@ -190,13 +190,13 @@ def _reading(sensor: Any, pose: int) -> Array:
 
 
 class _Scene:
-    """What a mounted sensor, at T in the beginning, sees: points that stay where they are, or always the same."""
+    """The scene of a mounted sensor, at T in the beginning: points that stay where they are, or constant views."""
 
     def __init__(self, mount: Mount, T: Array) -> None:
         self.sensor, rng = mount.sensor, np.random.default_rng(0)
         self.fixed: Array | None = None
         self.places: Array | None = None  # where the points are that stay, (SEEN, 2 or 3),
-        self.points: Array | None = None  # and others that it sees
+        self.points: Array | None = None  # and others that it observes
         if isinstance(self.sensor, SegmentVisible) and (size := image_size(self.sensor)) is not None:
             inside = rng.uniform(LOST_PIXELS, 1.0 - LOST_PIXELS, (SEEN, len(self.sensor.columns)))
             self.fixed = inside * [*size, *size]
