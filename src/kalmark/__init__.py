@@ -1,4 +1,4 @@
-"""kalmark: EKF-SLAM with a covariance that stays honest.
+"""kalmark: EKF-SLAM with a covariance that stays consistent.
 
 import kalmark as km
 
@@ -73,7 +73,7 @@ _NAMES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for on first use: the compiled models take a second that `kalmark --help` need not wait."""
+    """Import a name on its first use: the compiled models take a second that `kalmark --help` need not wait."""
     home = _MODULES.get(name) or next((module for module, names in _NAMES.items() if name in names), None)
     if home is None:
         raise AttributeError(f"module 'kalmark' has no attribute {name!r}")

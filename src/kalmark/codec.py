@@ -24,7 +24,7 @@ NOT_FINITE = ("inf", "-inf", "nan")  # JSON has no numbers for them
 
 
 class Writer:
-    """Writes values by their hints, `special` ones by functions of their own; `at` says where in the record it is."""
+    """Writes values by their hints, `special` ones by functions of their own; `at` is the place in the record."""
 
     def __init__(self, special: Mapping[Any, Callable[[Any], Any]]) -> None:
         self.special, self.at = special, list[Any]()
@@ -62,7 +62,7 @@ def place(of: Reader | Writer) -> str:
 
 
 class Kind:
-    """How values of one hint are written and read: here those that JSON has as they are.
+    """Writer and reader of the values of one hint: here those that JSON has as they are.
 
     Both raise MapError for a value of another type.
     """

@@ -10,8 +10,8 @@ filter calls the models so, hence its code does not depend on theirs: each has a
 Each file of compiled code ends with the SHA-256 of its name and content.  One that is damaged or cut, or
 another one under its name, counts as none and is made anew: what numba would take out of it might do anything.
 
-An address holds in the process that made it, as long as the function lives.  So it is always an argument of compiled
-code, never a constant in it that the disk would keep; who is copied to another process leaves it behind and asks again.
+An address is valid in the process that made it, as long as the function lives.  So it is always an argument of compiled
+code, never a constant in it that the disk would keep; a copy in another process computes its own.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ LONGEST_WAIT_S = 300.0  # for another process that compiles the same function
 
 _FUNCTIONS: dict[int, Any] = {}  # by their addresses; they are kept alive here
 
-SOURCES = {  # what code is compiled from; the filter knows of the models how `observe` calls them
+SOURCES = {  # what code is compiled from; of the models the filter depends on `observe` alone
     "models": ("compiled.py", "geometry/*.py", "models/*.py"),
     "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py"),
     "results": ("compiled.py", "geometry/*.py", "filter/kernels.py", "results/measures.py"),
@@ -196,7 +196,7 @@ class _OpenedLater(FunctionCache):  # type: ignore[misc, unused-ignore]
 
 @cache
 def _say_not_kept(folder: str, why: str) -> None:
-    """Say on stderr that code cannot be kept, once in a process."""
+    """Warn on stderr that code cannot be kept, once in a process."""
     if parent_process() is None:
         sys.stderr.write(
             f"kalmark: warning: compiled code cannot be kept in {folder} ({why}) and is compiled again the next time; "
@@ -225,7 +225,7 @@ def address_of(function: Any, signature: Signature) -> int:
 
 @cache
 def say_compiling() -> None:
-    """Say on stderr that this takes longer than it will the next time; once in a process."""
+    """Note on stderr that this takes longer than it will the next time; once in a process."""
     sys.stderr.write(COMPILING)
 
 
@@ -258,7 +258,7 @@ def ahead(function: Any, job: Callable[..., None], *arguments: str | int) -> Non
 
 
 def work_ahead(text: str, mark: str) -> None:
-    """Do the job that `ahead` was asked for; the file `mark` says that it is done."""
+    """Do the job of a call of `ahead`; the file `mark` shows that it is done."""
     module, name, *arguments = json.loads(text)
     getattr(import_module(module), name)(*arguments)
     Path(mark).touch()
@@ -272,7 +272,7 @@ def caught_up(function: Any) -> None:
 
 
 class _Announcer(event.Listener):  # type: ignore[misc, unused-ignore]
-    """Says so when an inner loop is being compiled; one loaded from the disk is not, and many workers say nothing."""
+    """Note when an inner loop is being compiled; one loaded from the disk is not, and many workers note nothing."""
 
     def on_start(self, event: Any) -> None:
         if event.data["dispatcher"].py_func.__module__.startswith("kalmark.") and parent_process() is None:

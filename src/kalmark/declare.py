@@ -129,7 +129,7 @@ class Parameter:
 
     @property
     def wanted(self) -> str:
-        """What a value is to be, in words."""
+        """The expected value, in words."""
         if self.type is None:
             return f"one of {', '.join(self.words)}"
         number = self.within.words("whole number" if self.type is int else "number")

@@ -1,4 +1,4 @@
-"""The errors kalmark raises on bad input: one line each, saying what, where and what was expected."""
+"""The errors kalmark raises on bad input: one line each: what, where and what was expected."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ImageError(EventError):
 class ModelError(KalmarkError):
     """A motion, sensor or landmark model that is wrong in itself or does not fit the others.
 
-    `key` is the parameter that is wrong, if it is one, and `wanted` what it is to be.
+    `key` is the parameter that is wrong, if it is one, and `wanted` its expected value.
     """
 
     key = ""

@@ -1,6 +1,6 @@
 """The events of a robot: `Control`, `Scan`, `Frame` and `Fix`, the only input of the filter.
 
-Logs, the simulator and a live robot all speak these four.  Time is int64 nanoseconds inside, seconds at the edge.
+Logs, the simulator and a live robot all give these four.  Time is int64 nanoseconds inside, seconds at the edge.
 """
 
 from __future__ import annotations
@@ -214,7 +214,7 @@ def _rows(y: Array) -> Array:
 
 
 class _Timed:
-    """What happens at a time, of which `t_ns` are the nanoseconds."""
+    """An event at a time, of which `t_ns` are the nanoseconds."""
 
     __slots__ = ()
     t_ns: int
@@ -272,7 +272,7 @@ class Control(_Timed):
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
 class Scan(_Timed):
-    """What one sensor of one robot saw at one instant: K observations `y` of shape (K, m).
+    """A scan of one sensor of one robot at one instant: K observations `y` of shape (K, m).
 
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
     overrides the noise of the sensor model.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
@@ -344,7 +344,7 @@ class Fix(_Timed):
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
 class Frame(_Timed):
-    """What one camera of one robot took at one instant: an image, and the depth of its pixels where that is measured.
+    """A frame of one camera of one robot at one instant: an image, and the depth of its pixels where that is measured.
 
     The detector of its sensor makes a scan of it.  `image` (H, W) or (H, W, 3) of bytes, blue, green and red, `right`,
     that of the right camera of a rectified pair, of which `image` is the left one, and `depth` (H, W) in m, 0 where

@@ -1,7 +1,7 @@
 """Results on disk: a file or a folder holds its old content or its new one, whole, whenever the program is killed.
 
 All writers of results write beside the place and then rename.  Names beside are unique, so that two programs may write
-to one place: the one that comes last stays.  What a killed program left beside is removed by a later writer.
+to one place: the one that comes last stays.  A temporary file of a killed program is removed by a later writer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import numpy as np
 from kalmark.errors import KalmarkError
 
 STALE_S = 3600.0  # older than this, what is beside a result was left by a program that was killed
-POLL_S = 0.05  # between two looks at a lock
+POLL_S = 0.05  # between two tests of a lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
 MOST_NODES = 1_000_000  # of a YAML file, its aliases counted as what they stand for
 PIECE = 1 << 20  # bytes that are unpacked at once
@@ -169,7 +169,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path, shared: bool = False, wait_s: float | None = None) -> Iterator[bool]:
-    """Hold the lock of a folder, or of a file NAME.lock, which is made if it is missing; say whether it was got.
+    """Hold the lock of a folder, or of a file NAME.lock, which is made if it is missing; yield whether it was got.
 
     Waits for other programs, for at most `wait_s`.  Goes on without where the system has no locks or cannot open it.
     """
@@ -210,7 +210,7 @@ def _locked(path: Path, shared: bool, wait_s: float | None) -> int:
 
 
 def read_arrays(path: Path, error: type[KalmarkError]) -> dict[str, Any]:
-    """Read the arrays of an .npz file, each as long as it says.  Raises `error`, ValueError or OSError."""
+    """Read the arrays of an .npz file, each of the length in its header.  Raises `error`, ValueError or OSError."""
     arrays = {}
     try:
         with zipfile.ZipFile(path) as archive:
@@ -269,7 +269,7 @@ def most_unpacked(path: Path) -> int:
 
 
 def refuse_bomb(archive: zipfile.ZipFile, path: Path, error: type[KalmarkError]) -> None:
-    """Refuse an archive whose members say that they are far larger than the file, before any of them is unpacked."""
+    """Refuse an archive whose members have sizes far larger than the file, before any of them is unpacked."""
     size, most = sum(member.file_size for member in archive.infolist()), most_unpacked(path)
     if size > most:
         raise error(f"{path}: {size} bytes in a file of {path.stat().st_size}, expected at most {most}")

@@ -26,7 +26,7 @@ __all__ = [
 ]  # fmt: skip
 
 HOKUYO = "Hokuyo, Communication Protocol Specification for SCIP2.0, C-42-03320B"
-WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat, a laser that sees cylinders"
+WOODS = "T. Barfoot, Lost in the Woods, dataset2.mat, a laser that detects cylinders"
 FAQ = "Devantech, Ultrasonic Rangers FAQ, robot-electronics.co.uk/htm/sonar_faq.htm"
 SRF08 = "Devantech SRF08, technical specifications: range 3 cm to 6 m, robot-italy.com"
 D435 = "Intel, High-speed capture mode of the RealSense depth camera D435, rev. 1.2"
@@ -135,7 +135,7 @@ RFID = _preset(
     sigma_range_rel=(0.15 * math.sqrt(math.pi / 2), FADING),
     sigma_bearing_rad=(math.radians(3.3), f"{ARRIVAL}: 3.3 deg rms with two antennas in line of sight"),
     range_max_m=(6.0, f"{TAGS}: the detection range is approximately 6 m"),
-    fov_rad=(math.pi, "two antennas half a wavelength apart tell directions from -90 to 90 deg"),
+    fov_rad=(math.pi, "two antennas half a wavelength apart measure directions from -90 to 90 deg"),
     rate_hz=(1.0, "assumption: one inventory a second"),
     dropouts=(0.34, f"{MULTI_TAG}: detection probability can be as low as 66 %"),
 )

@@ -49,7 +49,7 @@ class Candidate(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """What was compared: observations (M,) with the `numbers` (M,) of landmarks (L,), and their squared distances (M,).
+    """Compared pairs: observations (M,) with the `numbers` (M,) of landmarks (L,), and their squared distances (M,).
 
     `places` (L, 2 or 3) are those of the landmarks.
     """
@@ -109,7 +109,7 @@ class Gap(NamedTuple):
 
     @property
     def lasts_s(self) -> float:
-        """How long it is."""
+        """Its duration."""
         return (self.end_ns - self.start_ns) * 1e-9
 
 
@@ -135,14 +135,14 @@ class Repeat(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Expectations:
-    """What a sensor of a robot should measure of landmarks (L of them), measured or not.  [S] 2.4, [TB] Obs.
+    """Expected measurements of landmarks (L of them) by a sensor of a robot, measured or not.  [S] 2.4, [TB] Obs.
 
-    `in_view` (L,) says which it should observe from where the filter has it, `why` what keeps it from the others ("" of
+    `in_view` (L,) marks those observable from its estimated pose, `why` is the reason of the others ("" of
     those in view).  e (L, m) is the expectation h(x), Z (L, p, p) the covariance that an innovation would have, with
     the noise of the sensor.  E_r (L, p, 3 or 6), E_s and E_p are the Jacobians in the robot's pose, in the mount,
     whether it is in the map or not, and in the parameters of the sensor that are in the map (none: 0 columns).  E_l
-    (L, p, n) is the Jacobian in the landmark.  Of a sensor that sees its velocity E_s is NaN.  All are padded with NaN
-    where landmarks differ in size, and NaN of what cannot be expected.
+    (L, p, n) is the Jacobian in the landmark.  Of a sensor that measures its velocity E_s is NaN.  All are padded with
+    NaN where landmarks differ in size, and NaN of what cannot be expected.
     """
 
     robot: str
@@ -163,9 +163,9 @@ class Expectations:
         return len(self.names)
 
     def row(self, name: Id) -> int:
-        """Return the row of a landmark in all arrays.  Raises MapError if it was not asked about."""
+        """Return the row of a landmark in all arrays.  Raises MapError if it is not among them."""
         if name not in self.names:
-            raise MapError(f"{name!r} is not among the {len(self)} landmarks asked about, expected one of them")
+            raise MapError(f"{name!r} is not among the {len(self)} landmarks of the query, expected one of them")
         return self.names.index(name)
 
     def ellipses(self, sigmas: float = 3.0, points: int = 40, axes: tuple[int, int] = (0, 1)) -> Array:
@@ -190,8 +190,8 @@ class Report:
     `compared` are the landmarks that observations were compared with, `seen_at` (K, 2 or 3) is where these seemed to
     come from.  `gaps` are times without controls, up to now, for which the pose was widened.
     `repeats` were found in the map after the scan, and not merged.
-    `replaced` is how far, in m, a robot was moved to where the last fixes place it that it did not believe.
-    `standing` is the reading of zero velocity that was added to the event, of a robot that was noticed to stand.
+    `replaced` is the distance in m by which a robot was moved to the position of the last fixes, which had not fitted.
+    `standing` is the reading of zero velocity that was added to the event, of a robot that was detected to stand.
     """
 
     __slots__ = (
@@ -215,7 +215,7 @@ class Report:
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
         self.event = event
-        self.judged: tuple[JudgedScan, ...] = ()  # of which `observations` are made when they are asked for
+        self.judged: tuple[JudgedScan, ...] = ()  # of which `observations` are made when they are needed
         self._made: tuple[Observation, ...] = ()
         self.removed: tuple[tuple[Id, str], ...] = ()
         self.merged: tuple[tuple[Id, Id, str], ...] = ()
@@ -233,7 +233,7 @@ class Report:
 
     @property
     def observations(self) -> tuple[Observation, ...]:
-        """What became of each observation, in their order."""
+        """The outcome of each observation, in their order."""
         if self.judged:
             self._made, self.judged = tuple(sorted(o for group in self.judged for o in outcomes_of(group))), ()
         return self._made
@@ -277,8 +277,8 @@ class Report:
 
     def __repr__(self) -> str:
         counts = {o: sum(obs.outcome == o for obs in self.observations) for o in OUTCOMES}
-        said = ", ".join(f"{n} {o}" for o, n in counts.items() if n) or "no observations"
-        return f"<Report of {type(self.event).__name__} at t={seconds(self.event.t_ns)} s: {said}>"
+        text = ", ".join(f"{n} {o}" for o, n in counts.items() if n) or "no observations"
+        return f"<Report of {type(self.event).__name__} at t={seconds(self.event.t_ns)} s: {text}>"
 
 
 class LandmarkEstimate(NamedTuple):

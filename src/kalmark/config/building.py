@@ -41,7 +41,7 @@ BY_SIGMAS = "state a start without at_rest, as uncertain as it is: sigma_rotatio
 
 
 def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
-    """Return the filter that a configuration describes, for the robots of a log and with what the log says of them.
+    """Return the filter that a configuration describes, for the robots of a log and with its description of them.
 
     Without a log the robots are those that the configuration names; `each` alone is one robot called "robot".  What is
     `given`, arguments of `Slam`, stands in the place of what is configured.
@@ -83,7 +83,7 @@ def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
 
 
 def slam_from_config(path_or_name: str | Path) -> Slam:
-    """Return the filter of a configuration file or shipped name; the log it names tells robots, starts and the rest."""
+    """Return the filter of a configuration file or shipped name; the log it names gives robots, starts and the rest."""
     config = load_config(path_or_name)
     return build_slam(config) if config.log.path is None else build_slam(*open_run(path_or_name))
 
@@ -112,7 +112,7 @@ def _plain(value: Any) -> Any:
 
 
 def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
-    """Return one robot with its sensors, started where the configuration says, or else the log's truth."""
+    """Return one robot with its sensors, started at the pose of the configuration, or else the log's truth."""
     key = name if name in config.robots else EACH
     if key not in config.robots:
         near = did_you_mean(name, [*config.robots])
@@ -161,7 +161,7 @@ def _placed(
 ) -> tuple[list[float], Array | None]:
     """Return where a section places a mount or a start, with its state, and the covariance.
 
-    Raises ConfigError where one of its exact keys says otherwise than the readable ones beside it.
+    Raises ConfigError where one of its exact keys contradicts the readable ones beside it.
     """
     said = vars(section)
     at, cov = [*pose_of(said), *state_of(said, behind)], covariance_of(said, dof, behind)
@@ -211,7 +211,7 @@ def _part(config: Config, path: tuple[str, ...], value: Any, world: str) -> Any:
 
 
 def _made(config: Config, path: tuple[str, ...], make: Callable[..., Any], *args: Any, **keys: Any) -> Any:
-    """Return what `make` makes of these; what it refuses is told with the place of the section at `path`."""
+    """Return what `make` makes of these; errors name the place of the section at `path`."""
     try:
         return make(*args, **keys)
     except ModelError as error:

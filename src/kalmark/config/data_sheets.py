@@ -84,14 +84,14 @@ def _take_preset(tree: Tree, where: tuple[str, ...], section: Any) -> None:
 
     place, given = tree.place((*where, "preset")), section.pop("preset")
     if not isinstance(given, str) or given not in MOTIONS:
-        told = f"{place}: {'.'.join((*where, 'preset'))}: got {show(given)}"
-        raise ConfigError(f"{told}, expected one of {', '.join(MOTIONS)}")
+        got = f"{place}: {'.'.join((*where, 'preset'))}: got {show(given)}"
+        raise ConfigError(f"{got}, expected one of {', '.join(MOTIONS)}")
     unit, names = MOTIONS[given].sensor, {own.name for own in parameters(class_of("motion", "inertial"))}
     section |= {name: getattr(unit, name) for name in MOTIONS[given].sources if name in names} | section
 
 
 def _take(tree: Tree, path: Path | None, where: tuple[str, ...], section: Any) -> None:
-    """Put what the file of a motion or a sensor says in its place."""
+    """Replace the file of a motion or a sensor by its values."""
     key = KEY if where[-1] == "motion" and len(where) == 3 else CALIBRATION
     if not isinstance(section, dict) or key not in section or not _has_one(key, section.get("type")):
         return

@@ -49,15 +49,15 @@ estimator: {{type: invariant}}
 
 A log may describe its own rig: a recording its camera, a data set its calibration and the noise of its sensors.  Then
 a key that is left out, in any section here, has the log's value, and a section may hold single keys without its `type`;
-another `type` than the log's drops what the log says of that section, but for a mount.
+another `type` than the log's drops the log's values of that section, but for a mount.
 
 `robots.each` holds for every robot, `sensors.each` for every sensor of the log.  An entry with a name beside it is laid
 over it, key by key; so is `--set` of a name that has no entry, and `--set` of `each` is set for all of them.
 
 Lengths are metres, angles radians (degrees in keys that end in `_deg`), times seconds.  Robots move in the plane or in
-space, as their `motion` says, all robots of a log in the same; mounts and starts have other keys in each.  A control's
+space, by their `motion`, all robots of a log in the same; mounts and starts have other keys in each.  A control's
 noise is either the error of the control held over its interval (`sigma_v_mps`: the displacement's error is sigma times
-the duration) or a random walk (`..._per_sqrt_s`), which acts while the robot is told to move.  A gate is the
+the duration) or a random walk (`..._per_sqrt_s`), which acts while the control is not zero.  A gate is the
 probability with which a right observation is let through:
 0.9973 is the 3 sigma of one dimension; `default` is the estimator's own (`ekf`: squared distance below 9; the others:
 no gate).

@@ -20,7 +20,7 @@ TAKERS = "pinhole", "segments"  # types of sensors that can take them
 
 
 def complete(tree: Tree) -> None:
-    """Give sensors that take the images of a camera what they do not say: its intrinsics and its mount, in place."""
+    """Give sensors of the images of a camera the values that they lack, its intrinsics and its mount, in place."""
     robots: Any = tree.values.get("robots")
     for robot in robots.values() if isinstance(robots, dict) else ():
         sensors: Any = robot.get("sensors") if isinstance(robot, dict) else None

@@ -1,4 +1,4 @@
-"""From a configuration to its log, and to what is in force: what the user wrote over what the log says of itself."""
+"""The log of a configuration, and the values in force: the user's over those that the log describes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def open_run(
 ) -> tuple[Config, Log]:
     """Return a configuration as it is in force, and the log it names, or the one at `log_path` read in the same way.
 
-    What the log describes of its robots, sensors and landmarks is in force where the configuration says nothing.
+    The log's description of its robots, sensors and landmarks is in force where the configuration has no value.
     In the place of a configuration there may be a log that describes all of its rig itself.
     Raises ConfigError, LogError.
     """
@@ -79,7 +79,7 @@ def known_path(config: Config) -> Path:
 
 
 def described(config: Config, log: Log) -> Config:
-    """Return a configuration with what its log describes in force where it says nothing."""
+    """Return a configuration with its log's description in force where it has no value."""
     if not log.describes:
         return config
     tree = Tree(config.model_dump(exclude_unset=True), places=dict(config._where))

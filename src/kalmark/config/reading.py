@@ -1,4 +1,4 @@
-"""Read a configuration: YAML in, a checked `Config` out, or one line that says what is wrong and where."""
+"""Read a configuration: YAML in, a checked `Config` out, or one line of error."""
 
 from __future__ import annotations
 

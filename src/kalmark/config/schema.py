@@ -107,8 +107,8 @@ class MountConfig(PlanePose):
 class SpaceMountConfig(SpacePose):
     """Where a sensor sits, in the robot's frame; turned by roll, then pitch, then yaw about the robot's axes.
 
-    A camera looks along its own z axis, x to the right in its image and y down: one that looks ahead has roll -90 and
-    yaw -90 deg.  If either sigma is above 0 the mount is in the map, and the filter calibrates it.
+    The optical axis of a camera is its z axis, x to the right in its image and y down: one pointing ahead has roll -90
+    and yaw -90 deg.  If either sigma is above 0 the mount is in the map, and the filter calibrates it.
     """
 
 
@@ -132,7 +132,7 @@ class StartConfig(PlanePose):
     sigma_slip: NotNegative = 0.0
     """slipping_unicycle: standard deviation of the slip."""
     state: Numbers | None = None
-    """What the state has behind its pose, of a motion of your own with other names than these."""
+    """Components of the state after its pose, of a motion of your own with other names than these."""
 
 
 class SpaceStartConfig(SpacePose):
@@ -181,7 +181,7 @@ class SpaceStartConfig(SpacePose):
     sigma_gravity_mps2: Sigmas = 0.0
     """inertial_gravity: standard deviation of each coordinate of the gravity; or a list of three."""
     state: Numbers | None = None
-    """What the state has behind its pose, of a motion of your own with other names than these."""
+    """Components of the state after its pose, of a motion of your own with other names than these."""
 
 
 @register("initialization", "immediate")
@@ -198,22 +198,22 @@ Preset = Literal[
 
 
 class Mounted(ModelSection):
-    """What every sensor has, whatever its type; and a `mount`, see below."""
+    """Keys of every sensor of any type; and a `mount`, see below."""
 
     landmark: Landmark | None = None
-    """Landmark type of this sensor; `landmarks` if absent.  A camera whose mount is calibrated wants anchored ones."""
+    """Landmark type of this sensor; `landmarks` if absent.  A camera with a calibrated mount requires anchored ones."""
     association: Association | None = None
     """Association of this sensor; the configuration's `association` if absent."""
     attention: Attention | None = None
     """Which landmarks of a scan to take; all if absent."""
     upkeep: Upkeep | None = None
-    """What makes a landmark; the configuration's `upkeep` if absent."""
+    """Confirmation of landmarks; the configuration's `upkeep` if absent."""
     detector: Detector | None = None
-    """How landmarks are found in raw scans: one that finds what the sensor measures."""
+    """Detector of landmarks in raw scans: one that finds what the sensor measures."""
     initialization: Initialization = section_of("initialization", "immediate")()
     """Start landmarks at first sight, or late; late ones are points."""
     robust: Literal["huber", "student"] | None = None
-    """How outliers count less: bounded, or hardly at all.  All observations count in full if absent."""
+    """Robust weight of outliers: bounded, or nearly zero.  All observations count in full if absent."""
     preset: Preset | None = None
     """Take what is not given from a documented sensor of this type: see presets.md."""
 
@@ -233,7 +233,7 @@ class Mounted(ModelSection):
 
 
 class PlaneMounted(Mounted):
-    """What every sensor of the plane has."""
+    """Keys of every sensor of the plane."""
 
     mount: MountConfig = MountConfig()
     """Where the sensor sits on the robot."""
@@ -245,7 +245,7 @@ class PlaneMounted(Mounted):
 
 
 class SpaceMounted(Mounted):
-    """What every sensor of space has."""
+    """Keys of every sensor of space."""
 
     images: str | None = None
     """Take the images of this camera of the robot, straightened; intrinsics and mount are that camera's if absent."""
@@ -259,14 +259,14 @@ SpaceSensor = Annotated[Any, Choice("sensor", "space")]
 
 
 def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None:
-    """Refuse what a start says of a state that its motion does not have.  Raises ValueError."""
+    """Refuse values of a start for a state that its motion does not have.  Raises ValueError."""
     has = known(state_columns(model_of(motion)), world_of(vars(start)))
     allowed = {*has, *(sigma_of(name)[0] for name in has)}
     if isinstance(start, SpaceStartConfig) and start.at_rest:
         if "bias_ax_mps2" not in has:
             raise expected(f"false: {motion.type} has no inertial unit", "start", "at_rest")
         if not np.all(_three(start.sigma_bias_a_mps2)):
-            raise expected("a number > 0: at rest a bias looks like a tilt", "start", "sigma_bias_a_mps2")
+            raise expected("a number > 0: at rest a bias is taken for a tilt", "start", "sigma_bias_a_mps2")
     states = *STATES["plane"], *STATES["space"]
     for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
@@ -302,9 +302,9 @@ class LogConfig(Section):
     to_s: Number | None = None
     """End here, counted from the first event of the log."""
     on_error: Literal["raise", "skip"] = "raise"
-    """What to do with bad input: refuse, or leave out."""
+    """Action on bad input: refuse, or leave out."""
     ids: Literal["given", "hidden"] = "given"
-    """`hidden`: the filter is not told which landmark is which; the summary says how often it was wrong."""
+    """`hidden`: the filter gets no ids of landmarks; the summary has its rate of wrong associations."""
     truth: str | dict[str, str] | None = None
     """A file of true poses in the format of TUM or KITTI, to score against; by robot if there are several."""
     fixes: str | dict[str, str] | None = None
@@ -402,7 +402,7 @@ TRUTH = "truth"  # what stands for a file with the true landmarks
 
 
 class MapConfig(Section):
-    """How the covariance is kept."""
+    """Storage of the covariance."""
 
     type: Literal["auto", "dense", "postponed"] = "auto"
     """`dense` corrects the whole covariance at once, `postponed` only what is in view, `auto` is dense while small."""
@@ -414,7 +414,7 @@ class MapConfig(Section):
     known: str | None = None
     """Landmarks known: a landmarks.csv or tagslam.yaml, beside this file or in KALMARK_DATA; `truth`: of the log."""
     exact: bool = False
-    """Take the landmarks of `known` as exact, whatever the columns cov_... of the file say."""
+    """Take the landmarks of `known` as exact, without the columns cov_... of the file."""
 
     @property
     def linearity(self) -> float | None:
@@ -427,7 +427,7 @@ def _each() -> dict[str, AnyRobot]:
 
 
 class OfFile(Section):
-    """What is read from a file; its name is that of the file, or of the folder of a file that is `called` so."""
+    """Data read from a file; its name is that of the file, or of the folder of a file that is `called` so."""
 
     called: ClassVar[str]
     _file: Path | None = PrivateAttr(None)
@@ -463,7 +463,7 @@ class Config(OfFile):
     association: Association = section_of("association", "identity")()
     """Which landmark was that."""
     upkeep: Upkeep = section_of("upkeep", "upkeep")()
-    """What makes a landmark of sightings without an id."""
+    """Confirmation of landmarks from observations without an id."""
     estimator: Estimator = section_of("estimator", "invariant")()
     """Filter."""
     map: MapConfig = MapConfig()

@@ -1,7 +1,7 @@
 """YAML files as plain values with their places, and `--set` overrides laid over them.
 
-What a file says of ``robots.each`` or ``sensors.each`` lies below the entries named beside it, key by key.  An override
-of `each` is one of all entries; one of a name that the file does not have begins with what `each` is.
+The values of ``robots.each`` or ``sensors.each`` in a file lie below the entries named beside it, key by key.  An
+override of `each` is one of all entries; one of a name that the file does not have begins with what `each` is.
 """
 
 from __future__ import annotations

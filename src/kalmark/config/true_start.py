@@ -17,9 +17,9 @@ from kalmark.models.protocols import Motion, coasts
 def true_start(log: Log, name: str, motion: Motion) -> tuple[Array | None, Array | None]:
     """Return the true pose (3,) or (7,) of a robot when its first event begins, and its covariance; None of none.
 
-    Where the truth begins later, the first true pose T is moved back by what the controls say of the way there:
-    T D^-1, with the covariance of D by the noise of the motion.  A robot whose velocity is in its state has no controls
-    that say so.
+    Where the truth begins later, the first true pose T is moved back by the motion D of the controls:
+    T D^-1, with the covariance of D by the noise of the motion.  A robot whose velocity is in its state has no such
+    controls.
     """
     held = motion.held or coasts(motion)
     truth, begin = log.truth.get(name), begins_at(log.events, name, held)

@@ -1,4 +1,4 @@
-"""The rate of wrong associations, where the log knows the landmarks and the filter did not."""
+"""The rate of wrong associations, where the log has ids of landmarks that the filter did not get."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def best_known(history: History, ids: list[Id], observations: list[int]) -> dict
 
 
 def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]:
-    """Return the figures of an association without ids, {} if the filter was told all the log knows.
+    """Return the figures of an association without ids, {} if the filter got all ids of the log.
 
     `wrong` counts the fused observations whose id is not that of most of their landmark, of `judged`; `duplicates` are
     the landmarks beyond one for each id; `nameless` observations have no id in the log either (spurious ones, where it
-    marks them), and `nameless_fused` says how many of them were fused all the same.
+    marks them), and `nameless_fused` counts those of them that were fused all the same.
     """
     hidden = (history.id == "") & (history.true_id != "")
     if not hidden.any():
@@ -63,9 +63,9 @@ def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]
 def no_ids(run: Recording) -> bool:
     """Return whether a run's landmarks can be matched to the true ones by their positions alone."""
     history, true = run.history, {str(i) for i in run.truth.landmarks}
-    told = (history.id != "") & ~np.isin(history.id, history.robots) & ~history.of_own
+    given = (history.id != "") & ~np.isin(history.id, history.robots) & ~history.of_own
     return (
-        not (told | (history.true_id != "")).any()
+        not (given | (history.true_id != "")).any()
         and bool(true)
         and len(run.landmarks) > 0
         and true.isdisjoint(map(str, run.landmarks.ids))

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
     """Return the entry `batch` of a run's summary: `compare`, or of a run that saw tags `compare_tags`.
 
-    Where the log does not tell which landmark an observation is of, that is decided again (`second_opinion`).  The log
+    The association of observations without ids in the log is decided again (`second_opinion`).  The log
     is read again unless it is given or not needed.
     """
     if not np.isnan(run.history.left_px).all():
@@ -60,7 +60,7 @@ def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dic
 
 
 def unknown(run: Recording) -> Flags:
-    """Return which observations (O,) a filter had to associate: the log does not say what they are of."""
+    """Return which observations (O,) a filter had to associate: those without ids in the log."""
     return (run.history.id == "") & (run.history.outcome != "ignored")
 
 
@@ -96,7 +96,7 @@ class Opinion:
 
 
 def second_opinion(run: Recording, log: Log | Iterable[Event], *, known: Known | None = None) -> Opinion:
-    """Find the batch solution of a run whose log does not tell all associations: they are decided again about it.
+    """Find the batch solution of a run whose log does not give all associations, which are decided again at it.
 
     Begins at the associations of the filter; see `kalmark.batch.reassociation`.  Raises KalmarkError as `solve_batch`.
     """
@@ -201,7 +201,7 @@ def _moved(history: History, again: Mapping[str, Restart]) -> Array:
 
 
 def _start(start: RobotStart, again: Restart | None) -> tuple[Array, Array]:
-    """Return mean and covariance of a robot at its start; a start that was wrong says nothing."""
+    """Return mean and covariance of a robot at its start; a start that was wrong has no information."""
     if again is None:
         return start.mean, start.covariance
     mean, cov, d = start.mean.copy(), start.covariance.copy(), len(again.onto.shift)
@@ -240,7 +240,7 @@ def of_the_filter_alone(slam: Slam) -> set[tuple[str, str]]:
 
 
 def _of_places(history: History, slam: Slam, rows: Index) -> Index:
-    """Return those rows of the history that say where landmarks or other robots are, seen from a pose alone.
+    """Return those rows of the history that measure positions of landmarks or other robots from a pose alone.
 
     Readings of the state do not, nor do range rates.
     """
@@ -320,15 +320,16 @@ def tag_problem(run: Recording) -> Problem:
 def compare(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None) -> dict[str, Any]:
     """Return how far the filter's map and path are from the optimum of the same data.
 
-    `merged` says which landmark of the batch solution one of the filter has become.
+    `merged` maps landmarks of the filter to those of the batch solution that they were merged into.
 
-    `sigma_ratio`: median over landmarks of the filter's sigma over the batch's (1: honest, below: overconfident).
+    `sigma_ratio`: median over landmarks of the filter's sigma over the batch's (1: consistent, below: overconfident).
     `map_difference_m`: RMS over landmarks of the distance between the two.  `map_difference_sigma`: the largest
     such distance over the batch's sigma of that landmark, `map_difference_filter_sigma`: over the filter's own.
-    `path_ratio`: with truth, the filter's raw position RMSE over the batch's, which sees the future, else None.
+    `path_ratio`: with truth, the filter's raw position RMSE over the batch's, which uses later data, else None.
     `path_difference_m`: RMS over steps of the distance.  `path_difference_sigma`: RMS over steps and coordinates of the
-    difference of the poses in the filter's own sigmas, at most 1 of an honest filter, whose difference from the batch
-    solution has the covariance P_filter - P_batch; `pose_differences` is that over time, a robot and stretch a row.
+    difference of the poses in the filter's own sigmas, at most 1 of a consistent filter, whose difference from the
+    batch solution has the covariance P_filter - P_batch; `pose_differences` is that over time, a robot and stretch a
+    row.
     """
     at, same, mine = {id_: j for j, id_ in enumerate(batch.ids)}, merged or {}, filtered_map(run)
     rows = [(id_, at[same.get(id_, id_)]) for id_ in mine if same.get(id_, id_) in at]
@@ -376,7 +377,7 @@ def compare_tags(run: Recording, problem: Problem, batch: Batch) -> dict[str, An
 
     The filter's path is as it was then, with the map and the mounts that the run ended with.  `median_px`: of the
     corners' distances.  `sigma_ratio`: median over the tags of the filter's sigma of position over the batch's, which
-    knows nothing of the motion: expect it below 1 where tags are seen briefly.
+    does not use the motion: expect it below 1 where tags are seen briefly.
     """
     states, slam = (batch.state, problem.start), run.final_slam()
     left, filter_left = (np.concatenate([z for _, z in problem.left(state)]) for state in states)
@@ -407,7 +408,7 @@ def compare_tags(run: Recording, problem: Problem, batch: Batch) -> dict[str, An
 
 
 def log_of(run: Recording) -> Iterable[Event]:
-    """Return the log a run was made from, read again as its configuration says if the run does not hold it."""
+    """Return the log a run was made from, read again by its configuration if the run does not hold it."""
     if run.source is not None:
         return run.source
     from kalmark.config.opening import open_config_log
@@ -415,12 +416,12 @@ def log_of(run: Recording) -> Iterable[Event]:
 
     what = "batch solution: the run"
     if run.log.path is None:
-        raise KalmarkError(f"{what} does not say which log it was made from, expected the log itself")
+        raise KalmarkError(f"{what} does not name the log it was made from, expected the log itself")
     run.run_plugins()
     try:
         config = Config.model_validate({"log": run.config.get("log", {})})
     except ValueError as error:
-        raise KalmarkError(f"{what}'s configuration does not say how to read its log: {error}") from None
+        raise KalmarkError(f"{what}'s configuration does not determine how to read its log: {error}") from None
     return open_config_log(config, run.log.path)
 
 

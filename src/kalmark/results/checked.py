@@ -1,4 +1,4 @@
-"""Statuses of a map or a path: what its own log says of it."""
+"""Statuses of a map or a path: by its own log."""
 
 from __future__ import annotations
 

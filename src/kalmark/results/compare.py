@@ -24,7 +24,7 @@ from kalmark.results.scene import COLOURS, INK, Scene
 
 DRAWN = 6  # maps in the picture at most; the curves are of all runs
 PANEL, CURVES = 5.0, 2.6  # inches: a map, the curves
-OF_ITS_OWN = ("version", "seed")  # keys of a configuration that say nothing of the filter
+OF_ITS_OWN = ("version", "seed")  # keys of a configuration that are not of the filter
 
 
 @dataclass(frozen=True, eq=False)

@@ -98,7 +98,7 @@ def left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
 
 
 def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
-    """Tell of the gaps that were bridged, and of controls that were left out, a line a robot."""
+    """Yield a line a robot of the gaps that were bridged, and of controls that were left out."""
     yield from (line for _, line in left_out({"gaps": gaps}))
     noted = [gap for gap in gaps if matters(gap) and gap["kind"] != RULED_OUT]
     for robot in dict.fromkeys(gap["robot"] for gap in noted):

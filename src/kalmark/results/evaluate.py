@@ -101,10 +101,10 @@ def evaluate(run: Recording) -> dict[str, Any]:
 
 
 def scale_notes(run: Recording, robots: dict[str, Any]) -> Iterator[str]:
-    """Yield a line for each robot of which nothing, or no sensor, tells the scale."""
+    """Yield a line for each robot whose scale is not observable, or not by a sensor."""
     for name, figures in robots.items():
         if figures.get("scale") is not None and scale_is_free(run, name):
-            yield f"nothing tells the scale of {name}'s path: compared after a similarity, and without pose NEES"
+            yield f"the scale of {name}'s path is not observable: compared after a similarity, and without pose NEES"
     for name in robots:
         coasts = run.motion(name).get("type") == "constant_velocity_3d"
         if coasts and sees_no_scale(run, name) and not scale_is_free(run, name):
@@ -197,7 +197,7 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
 
 
 def scale_is_free(run: Recording, name: str) -> bool:
-    """Return whether nothing tells the scale of what a robot sees, controls included."""
+    """Return whether neither sensors nor controls determine the scale of a robot's path."""
     return sees_no_scale(run, name) and run.history.controls.get(name) is None
 
 
@@ -240,7 +240,7 @@ def scale_figures(path: Array, truth: Array) -> dict[str, float]:
 
 
 def known_landmarks(run: Recording) -> MapLandmarks:
-    """Return the map at the end with the log's names, where the filter was not told them; without any, by position."""
+    """Return the map at the end with the log's names, where the filter did not get them; without any, by position."""
     names = best_known(run.history, run.landmarks.ids, run.landmarks.observations)
     if no_ids(run):
         names = by_position(run.landmarks, run.truth.landmarks_in_map())

@@ -56,8 +56,8 @@ class Fate:
 class Explanation:
     """One scan of a run: its step, time since the first scan, the robot, the gates on d2, all that was decided.
 
-    `in_log` is the time of the log in s, by which the scan is found again; `asked` says how the time asked for was
-    taken, where one was.
+    `in_log` is the time of the log in s, by which the scan is found again; `asked` is the text of a requested
+    time and how it was read.
     """
 
     step: int
@@ -73,7 +73,7 @@ class Explanation:
     asked: str = ""
 
     def lines(self) -> Iterator[str]:
-        """Tell it."""
+        """Yield the lines of its text."""
         d = 3 if len(self.pose) == 7 else 2
         sigma = math.sqrt(max(np.trace(self.covariance[:d, :d]) / d, 0.0))
         at = ", ".join(f"{x:.2f}" for x in self.pose[:d])
@@ -117,10 +117,10 @@ def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation
 
 
 def with_known(run: Recording, told: Explanation) -> Explanation:
-    """Return an explanation that also says where observations with an id were, and where their landmarks were expected.
+    """Return an explanation with the places of observations with an id, and those expected of their landmarks.
 
     Both are seen from the pose after the scan: the way from one to the other is the innovation.  Nothing is added where
-    the run has no map, or the sensor does not tell how far away it sees.
+    the run has no map, or the sensor measures no distance.
     """
     open_ = [k for k, fate in enumerate(told.fates) if fate.id and not np.isfinite(fate.seen_at).all()]
     if not open_:

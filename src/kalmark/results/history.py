@@ -69,7 +69,7 @@ class RelocatedRobot(NamedTuple):
 
 
 class LandmarkChange(NamedTuple):
-    """What became of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now."""
+    """The end of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now."""
 
     step: int
     landmark: str
@@ -198,14 +198,14 @@ class History:
 
     Steps: time, robot, its mean (S, n) and covariance (S, q, q) after the scan, its state `dead_reckoned` (S, n) by
     its controls alone, NaN without any, and the wall time in microseconds.
-    Observations: `step` is the row of the step, `id`, `landmark` and `true_id`, what the log knows and the filter may
+    Observations: `step` is the row of the step, `id`, `landmark` and `true_id`, which the log has and the filter may
     not, are texts ("" for none), `kind` is that of the landmark after the scan, `d2` is NaN where there is none;
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
-    NaN where robots or sensors differ in size.  `late` (O,) says which tentative ones were fused when their landmark
-    was confirmed.  `left_px` (O,) is what the corners of tags are off by after the scan
-    (`kalmark.results.filter_description.left_px`).  `noise` (O, p) are the sigmas stated of z, NaN where they are
-    not of its numbers.  `seen_at` (O, d) is where each observation without an id seemed to come from before the
-    scan, NaN where its sensor does not tell.
+    NaN where robots or sensors differ in size.  `late` (O,) marks the tentative ones that were fused when their
+    landmark was confirmed.  `left_px` (O,) is the error of the corners of tags after the scan
+    (`kalmark.results.filter_description.left_px`).  `noise` (O, p) are the sigmas stated of z, NaN where they are not
+    of its numbers.  `seen_at` (O, d) is the place of each observation without an id by the pose before the scan, NaN
+    where its sensor measures none.
 
     Observations `candidate_row` (C,) were compared with landmarks, `candidate_landmark` (C,), of distance
     `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks

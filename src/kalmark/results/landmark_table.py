@@ -47,7 +47,7 @@ DATUM = 128  # landmarks
 UNSEEN = "not seen again"
 TINY = 1e-30
 EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
-# kinds whose state is their place; what is not (inverse depth, say) is not well known yet
+# kinds whose state is their place; others (inverse depth, for example) are not well known yet
 EUCLIDEAN = ("", "point", "point3", "point_signature", "point_height", "tag")
 _POINT = ("x_m", "y_m", "z_m")
 _PLANE = {"point_signature": (*_POINT[:2], "signature"), "point_height": _POINT, "wall": ("x_m", "y_m", "x2_m", "y2_m")}
@@ -63,7 +63,7 @@ def places(
     """Return the places and covariances of the states (K, n) of landmarks of one model.
 
     `ends` (K of (2,)) are the abscissas of lines' ends.  The pose of a tag and a point of the plane, with its
-    signature or height, are their own places.  None if a model does not say where it is.
+    signature or height, are their own places.  None if a model has no position.
     """
     if model is None or model.space.kinds == SE3.kinds or isinstance(model, Point2D):
         return means, covariances
@@ -80,7 +80,7 @@ def places(
 
 
 class Shapes(NamedTuple):
-    """What is to be drawn of a map: Gaussian points (of lines both endpoints), `lines` (L, 2, d) and `tags` (T, 7).
+    """The drawing of a map: Gaussian points (of lines both endpoints), `lines` (L, 2, d) and `tags` (T, 7).
 
     Of the points: which landmark each belongs to (K,), `means` (K, d), `covariances` (K, d, d), and as its `group`
     whether it is of a Euclidean landmark (0), another (1) or a line (2).
@@ -174,7 +174,7 @@ class MapLandmarks:
     """The landmarks of a map: ids, kinds, places with covariances and how often each was observed.
 
     The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
-    in the map is (`kalmark.results.landmark_table`); NaN if its model does not say where it is.  `exact` are those
+    in the map is (`kalmark.results.landmark_table`); NaN if its model has no position.  `exact` are those
     known exactly beforehand, which the filter had outside its map.  `log_odds` are those that a landmark exists, of the
     landmarks that were looked at again, and `unseen` those that were not seen again where they should be.
     """

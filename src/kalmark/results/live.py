@@ -25,11 +25,11 @@ PIECE = 1 << 16  # bytes that are read at once
 
 
 class EndedError(Exception):
-    """The other side of a conversation is silent, or speaks another protocol: what it says is said to it."""
+    """Silence or a foreign protocol of the other side of a connection, to which the message is sent."""
 
 
 class Live:
-    """Takes lines, gives answers: objects for JSON.  `lost` says why the filter has ended, "" while it goes on.
+    """Answers to lines of input: objects for JSON.  `lost` is the reason why the filter has ended, "" while it goes on.
 
     The map is whole but within the context `changing`.
     """
@@ -39,7 +39,7 @@ class Live:
         self.changing = nullcontext() if changing is None else changing
 
     def ready(self) -> dict[str, Any]:
-        """Return what is said before the first line: the robots, and the columns of their controls and sensors."""
+        """Return the message before the first line: the robots, and the columns of their controls and sensors."""
         robots = {
             name: {
                 "u": [*robot.motion.columns],
@@ -50,7 +50,7 @@ class Live:
         return {"ready": True, "robots": robots}
 
     def answer(self, line: str) -> dict[str, Any]:
-        """Return the answer to a line: the estimate after its event, the map if it asks for it, or an error."""
+        """Return the answer to a line: the estimate after its event, the map if it requests it, or an error."""
         self.number += 1
         head = {"line": self.number}
         try:
@@ -61,9 +61,9 @@ class Live:
             with self.changing:
                 return head | self.estimate(event, self.process(event))
         except KalmarkError as error:
-            said = " ".join(str(error).split())
-            self.lost = said if isinstance(error, DivergedError) else ""
-            return head | {"error": said}
+            text = " ".join(str(error).split())
+            self.lost = text if isinstance(error, DivergedError) else ""
+            return head | {"error": text}
 
     def process(self, event: Event) -> Report:
         """Take an event; a second one of its robot and sensor at its time is refused: it was sent twice.
@@ -139,8 +139,8 @@ class Incoming:
             self.came += piece
             if self.stranger and (first := self.came.lstrip()[:1]):
                 if first != b"{":
-                    said = shown(self.came.decode("utf-8", "replace").splitlines()[0])
-                    raise EndedError(f"{said} is no object of JSON, expected events as docs/live.md has them")
+                    text = shown(self.came.decode("utf-8", "replace").splitlines()[0])
+                    raise EndedError(f"{text} is no object of JSON, expected events as docs/live.md has them")
                 self.stranger = False
             if not piece:
                 end = len(self.came) - 1
@@ -171,11 +171,11 @@ def converse(live: Live, incoming: Lines, outgoing: TextIO, after: Callable[[], 
     `after` is called after each answer.
     """
 
-    def say(told: dict[str, Any]) -> None:
-        outgoing.write(json.dumps(told, allow_nan=False) + "\n")
+    def send(answer: dict[str, Any]) -> None:
+        outgoing.write(json.dumps(answer, allow_nan=False) + "\n")
         outgoing.flush()
 
-    say(live.ready())
+    send(live.ready())
     try:
         while not live.lost and (line := incoming.readline(LONGEST_LINE + 1)):
             while len(line) > LONGEST_LINE and not line.endswith("\n"):  # the rest of a line that is too long
@@ -183,7 +183,7 @@ def converse(live: Live, incoming: Lines, outgoing: TextIO, after: Callable[[], 
                 if len(rest) <= LONGEST_LINE or rest.endswith("\n"):
                     break
             if line.strip():
-                say(live.answer(line))
+                send(live.answer(line))
                 after()
     except EndedError as error:
-        say({"error": str(error)})
+        send({"error": str(error)})

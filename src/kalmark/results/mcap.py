@@ -1,4 +1,4 @@
-"""A run as messages of ROS 2, for Foxglove and RViz: docs/bags.md says which carries what."""
+"""A run as messages of ROS 2, for Foxglove and RViz: docs/bags.md lists them."""
 
 from __future__ import annotations
 

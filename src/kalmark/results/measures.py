@@ -1,4 +1,4 @@
-"""Errors of an estimate and whether it says so itself: rigid alignment, RMSE, NEES, NIS and their chi-square bounds.
+"""Errors and consistency of an estimate: rigid alignment, RMSE, NEES, NIS and their chi-square bounds.
 
 Alignment (rotation and shift, no scale): Kabsch 1976 / Umeyama 1991, equations (39-42) of the latter with unit scale.
 Consistency: Bar-Shalom, Li, Kirubarajan 2001, section 5.4; Bailey et al. 2006 for the use in SLAM.  In the plane poses
@@ -276,7 +276,7 @@ def map_nees(d: Array, P: Array, first: Index, sizes: Index) -> Array:
     """Return the NEES of a map (6,), as `MAP_NEES` names them, of errors d (2, n) in own and in world coordinates.
 
     P (n or more, n or more) is the covariance of the joint state, in which landmarks have the rows from `first` (B,)
-    on, as many as `sizes` (B,) says.
+    on, `sizes` (B,) of them.
     """
     out, value, n = np.full(6, np.nan), np.empty(2), d.shape[1]
     sums, regular, dof = np.zeros(2), np.zeros(2), 0.0

@@ -1,4 +1,4 @@
-"""Feed a log to the filter and keep what it said, step by step."""
+"""Recording: a log is processed by the filter, and its reports are kept step by step."""
 
 from __future__ import annotations
 
@@ -65,10 +65,10 @@ def record(
 
     A bar on standard error appears after two seconds unless `progress` is False.  With `on_error` "skip" an event the
     filter refuses is left out and listed in `run.skipped`, as is always a frame whose image cannot be read.  A filter
-    that diverges so far that it refuses to go on ends the run in either case: `run.stopped` says why and the summary
-    has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's models.
-    Without `pictures` what only these show is left out, which is faster: the map on the way, and what was in view.
-    Raises LogError if the log has other columns than the filter's motions and sensors, or two units of time.
+    that diverges so far that it refuses to go on ends the run in either case: `run.stopped` is the reason and the
+    summary has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's
+    models.  Without `pictures` what only these show is left out, which is faster: the map on the way, and what was in
+    view.  Raises LogError if the log has other columns than the filter's motions and sensors, or two units of time.
     """
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
@@ -257,7 +257,7 @@ class _Recorder:
         spaces = [robot.motion.space for robot in self.slam.robots.values()]
         n, q = max(space.size for space in spaces), max(space.dof for space in spaces)
         late = {one for report in reports for one in report.late}
-        known = [self.log.true_ids.get(scan, scan.ids) for scan in self.scans]  # whether the filter was told or not
+        known = [self.log.true_ids.get(scan, scan.ids) for scan in self.scans]  # also those that the filter did not get
         ones = [1] * len(reports)
         return History(
             t_ns=np.array([r.t_ns for r in reports], dtype=np.int64),

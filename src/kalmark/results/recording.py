@@ -230,7 +230,7 @@ class Recording:
         if self.config.get("plugins") and not self.trusted:
             raise RunError(
                 f"{self.folder}/config.yaml names plug-ins, {shown(self.config['plugins'])}, whose code would be run: "
-                "expected --trust, or Run.load(folder, trust=True), of who knows that they are his"
+                "expected --trust, or Run.load(folder, trust=True), if you trust them"
             )
         for plugin in self.config.get("plugins") or ():
             load_plugin(Path(plugin))

@@ -51,7 +51,7 @@ def repeat_figures(run: Recording) -> list[dict[str, Any]]:
 
 
 def repeat_notes(history: History) -> Iterator[str]:
-    """Tell of the repeats that were merged while the map grew."""
+    """Yield warnings of the repeats that were merged while the map grew."""
     steps = [change.step for change in history.changes if change.reason.endswith(IN_A_REPEAT)]
     for step in dict.fromkeys(steps):
         when = float(history.t_ns[step]) * 1e-9

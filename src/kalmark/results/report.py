@@ -124,7 +124,7 @@ def robot_table(summary: dict[str, Any]) -> str:
 
 
 def summary_table(summary: dict[str, Any]) -> str:
-    """Return the table of all other figures in words; under the mouse, each tells its key in ``summary.json``."""
+    """Return the table of all other figures in words; the tooltip of each is its key in ``summary.json``."""
     figures = dict(_flat(summary))
     words = [*TOTALS, *MORE, *((f"batch.{key}", f"batch solution: {label}", unit) for key, label, unit in BATCH)]
     others = [name for name, value in summary.items() if isinstance(value, dict) and "ate_raw_m" in value]
@@ -359,13 +359,13 @@ def _gaps(stretches: Ints) -> list[int]:
 def reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
     """Return the commonest (outcome, reason, count); of too many, those that differ in a number only count as one."""
     pairs = zip(run.history.outcome.tolist(), run.history.reason.tolist(), strict=True)
-    said = Counter((outcome, reason) for outcome, reason in pairs if reason)
-    if len(said) > most:
+    counts = Counter((outcome, reason) for outcome, reason in pairs if reason)
+    if len(counts) > most:
         merged: Counter[tuple[str, str]] = Counter()
-        for (outcome, reason), count in said.items():
+        for (outcome, reason), count in counts.items():
             merged[outcome, re.sub(r"(?<!\bd)\d+(\.\d+)?(e[+-]?\d+)?", "…", reason)] += count
-        said = merged
-    return [(outcome, reason, count) for (outcome, reason), count in said.most_common(most)]
+        counts = merged
+    return [(outcome, reason, count) for (outcome, reason), count in counts.most_common(most)]
 
 
 def _association(run: Recording, t: Array, world: bool) -> dict[str, Any]:

@@ -28,7 +28,7 @@ class Run(Recording):
         """Return the figures of ``summary.json``; with `batch` also the comparison with the batch solution."""
         summary = evaluate(self)
         if batch:
-            from kalmark.results.batch import batch_entry  # heavy, and seldom wanted
+            from kalmark.results.batch import batch_entry  # heavy, and seldom needed
 
             summary["batch"] = batch_entry(self, self.source)
         for key in ("batch", "verdict"):

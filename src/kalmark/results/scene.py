@@ -3,8 +3,8 @@
 A `Scene` has paths, landmarks, truth, fixes and cameras, for robots in the plane (d = 2) and in space (d = 3) alike;
 `kalmark.results.plot` draws it for ``map.png``, `kalmark.results.report` writes it into the page.
 
-The columns of a camera's measurements say what they are: `u_px, v_px` is a point; `u1_px, v1_px, u2_px, v2_px` are the
-ends of a segment, four of them the corners of a tag; `ul_px, vl_px, ur_px, vr_px` is a point in a left and a right
+The columns of a camera's measurements determine their kind: `u_px, v_px` is a point; `u1_px, v1_px, u2_px, v2_px` are
+the ends of a segment, four of them the corners of a tag; `ul_px, vl_px, ur_px, vr_px` is a point in a left and a right
 image.
 """
 
@@ -152,12 +152,12 @@ class Scene:
 
     @property
     def of_what(self) -> str:
-        """What the ellipses are of, for a legend."""
+        """The text of the ellipses in a legend."""
         return "in the world" if self.world else "of the shape"
 
     @property
     def how(self) -> str:
-        """How the truth is drawn, for a legend."""
+        """The alignment of the truth, for a legend."""
         return ", aligned" if self.aligned else ""
 
     @property

@@ -55,7 +55,7 @@ def directions(prior: Array, posterior: Array, constants: Sequence[str] = ()) ->
     """Return the directions of a mount between a prior and a posterior covariance, the least observed first.
 
     The covariances are (3, 3) or (6, 6), and more with the `constants` of the sensor behind.
-    Axes that the prior knows exactly are left out.  Turns are about the axes of the robot.
+    Axes of zero prior variance are left out.  Turns are about the axes of the robot.
     """
     open_ = np.flatnonzero(np.diagonal(prior) > 0)
     axes_of = (*AXES[len(prior) - len(constants)], *constants)
@@ -78,7 +78,7 @@ def directions(prior: Array, posterior: Array, constants: Sequence[str] = ()) ->
 
 
 def mount_figures(mount: CalibratedMount) -> dict[str, Any]:
-    """Return where the filter believes a sensor to sit that calibrates itself, how far that is known, what was seen."""
+    """Return the estimated mount of a self-calibrating sensor, its sigmas, and the directions observed."""
     d, pose, dof = (3, 7, 6) if len(mount.mean) - len(mount.constants) == 7 else (2, 3, 3)
     sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
     axes = describe_pose(mount.mean[:pose])
@@ -98,7 +98,7 @@ def mount_figures(mount: CalibratedMount) -> dict[str, Any]:
 
 
 def bias_figures(bias: Biased, motion: Mapping[str, Any]) -> dict[str, float]:
-    """Return what the filter believes is to be added to a robot's controls, and how far that is known.
+    """Return the estimated correction to be added to a robot's controls, and its sigmas.
 
     Of a parameter of its `motion`, a radius or a track, it is the parameter itself: the configured one, corrected.
     """

@@ -1,7 +1,7 @@
 """Landmarks that were in view of a scan and were not measured, in the history of a run.  [TB] Obs.vis.
 
-It is asked before a scan is used, of some scans, and so many landmarks of each: what is kept is bounded, and so is the
-time that it takes, a few landmarks a scan.
+Expectations are computed before a scan is used, for some scans and so many landmarks of each: memory and time are
+bounded, a few landmarks a scan.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 SCANS, LANDMARKS = 500, 32  # at most so many scans of a run, and of each so many landmarks
-LOOKED_AT = 200  # landmarks of the map that are looked at, a scan: of a larger map, not every scan is asked
+LOOKED_AT = 200  # landmarks of the map that are examined, a scan: with a larger map, not at every scan
 KNOWN = ("associated", "new", "rejected")
 
 
 class Foresight:
-    """Asks a filter before its scans what is in view; a context, within which it is asked.
+    """Context in which the landmarks in view are found before the scans of a filter.
 
-    Of the scans that may be asked, those in `shown` are, whatever it costs.
+    The scans in `shown` are always among those.
     """
 
     def __init__(self, slam: Slam, scans: int, shown: Iterable[int] = ()) -> None:

@@ -41,7 +41,7 @@ def overall(verdict: Mapping[str, Any]) -> str:
 
 
 def _first(verdict: Mapping[str, Any]) -> str:
-    """Return the line that says it all: what the map, or the path, is, by which cause, and to what accuracy."""
+    """Return the summary line: the status of the map, or the path, its cause, and its accuracy."""
     harmful = [cause["name"] for cause in verdict["causes"] if not cause["harmless"]]
     why = f" because of {harmful[0]}" if harmful and verdict["map"] not in (OK, UNCHECKED) else ""
     why = ": the log does not check it" if verdict["map"] == UNCHECKED else why
@@ -57,7 +57,7 @@ def _worse(verdict: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _trust(verdict: Mapping[str, Any]) -> str:
-    """Return to what accuracy a map can be trusted."""
+    """Return the accuracy of a map, as text."""
     factor, accuracy, shift = (verdict[key] for key in ("sigma_factor", "accuracy_m", "shift_m"))
     if verdict["map"] != "ok":
         least = max(SEEN * (accuracy or 0.0), ROUNDING_M)

@@ -53,19 +53,19 @@ SCANS_PAIRED = 30  # in a window of pairs
 MOST_GAP_STEPS = 5
 NO_ID = "no id in the log"  # the reason that association by identity gives
 NIS_HIGH = 3.0  # per degree of freedom
-TOO_SMALL = "the noise is set too small"  # what a high one means, unless a verdict knows better
+TOO_SMALL = "the noise is set too small"  # the cause of a high one, unless a verdict finds another
 FIX_NIS_HIGH = 5.0
 FIRST_FIX = 0.9999  # of right starts pass the test of the first fix
 BEARINGS = ("range_bearing", "range_bearing_3d")
 ATTENTION = ("not among the ", "nearer than ", "more than ")  # how the reasons begin that an attention gives
 MARGIN = 0.1  # of an image, by which its measurements may lie outside it
 LISTED = 5  # of the times when readings moved a robot
-FEW_FIXES = 5  # fewer say little of the noise
+FEW_FIXES = 5  # fewer do not determine the noise
 LOW = 0.5  # squares of innovations over those of the stated noise: it is 1.4 times too large
 TINY_NIS = 0.1
 TINY = 1e-6  # of those squares, where a log has no noise
 NUMBER, SCANS = 100, 30  # of observations, of scans: with a right noise one in 30,000 sensors is below LOW
-NOTICES = registered_name(sensors.ZeroVelocity2D)  # a sensor that needs no observations
+NOTICES = registered_name(sensors.ZeroVelocity2D)  # a sensor that needs no rows in a log
 COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 
 
@@ -73,7 +73,7 @@ COLUMNS = {registered_name(cls): tuple(cls.columns) for cls in sensors.BUILT_IN}
 class Window:
     """A stretch of time: when it begins and ends, in seconds since the first step, and its figure.
 
-    `chance` is the part of the figure that says nothing, as it may be by chance.
+    `chance` is the part of the figure that may be by chance.
     """
 
     start_s: float
@@ -217,7 +217,7 @@ def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
 def signs(run: Recording, summary: Mapping[str, Any]) -> list[Sign]:
     """Return the warnings of a run, each with the best status that a verdict can have beside it.
 
-    Those about truth leave any, and so do those of which a verdict itself says what they do: about noise, starts that
+    Those about truth leave any, and so do those whose effect a verdict itself states: about noise, starts that
     fixes correct, robots that readings place elsewhere.
     """
     of_map = ((gap_warnings(summary["gaps"]), DOUBTFUL), (repeat_warnings(summary["repeats"]), WRONG))
@@ -324,7 +324,7 @@ def budgeted(history: History) -> Flags:
 
 
 def _unused(run: Recording) -> Iterator[str]:
-    """Tell of sensors most of whose observations could not be used, and that none was of a known thing."""
+    """Yield warnings of sensors most of whose observations could not be used, and of none of a known landmark."""
     history, robots = run.history, run.history.robot[run.history.step]
     by_design = budgeted(history) | (history.reason == AGAIN)
     pairs = sorted(set(zip(robots.tolist(), history.sensor.tolist(), strict=True)))
@@ -347,7 +347,7 @@ def _unused(run: Recording) -> Iterator[str]:
 
 
 def _images(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
-    """Tell of cameras whose measurements lie outside their images."""
+    """Yield warnings of cameras whose measurements lie outside their images."""
     history = run.history
     robots = history.robot[history.step]
     for camera in history.cameras:
@@ -440,7 +440,7 @@ def _first_fixes(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
             sigma = float(np.sqrt(max(np.trace(starts[name].covariance[:d, :d]) / d, 0.0)))
             yield (
                 f"the first fix of {name} is {figure(far)} m from where its start puts it, "
-                f"which the configuration says is known to {figure(sigma)} m: set robots.{name}.start"
+                f"with a configured sigma of {figure(sigma)} m: set robots.{name}.start"
             )
 
 
@@ -463,7 +463,7 @@ def _d2(fix: UsedFix) -> float:
 
 
 def too_sure(figures: Mapping[str, Any]) -> bool:
-    """Return whether the truth shows a robot's pose to be off by more than its covariance says."""
+    """Return whether the truth shows a robot's pose to be off by more than its covariance."""
     value, most = figures.get("pose_nees"), figures.get("pose_nees_most")
     return value is not None and most is not None and value > most
 
