@@ -149,8 +149,8 @@ class Estimate:
     def place(self, name: Id) -> tuple[Array, Array]:
         """Return where a robot or a landmark is: mean (2 or 3,) and covariance, m and m^2, in the map's frame.
 
-        A landmark's model gives its position (`HasPlace`); of a line it is its point nearest to the anchor or the origin.
-        Raises MapError for a landmark whose model has no position.
+        A landmark's model gives its position (`HasPlace`); of a line it is its point nearest to the anchor or the
+        origin.  Raises MapError for a landmark whose model has no position.
         """
         mean, P, model = self.mean(name), self.covariance(name), self.landmark_model(name)
         if model is None:
