@@ -39,8 +39,8 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "a range noise that grows": ("loop_b2", ["steps=300"]),
     "velocities": (
         DRIVE.format(
-            route="{type: wander, turn_radius_m: 0.5}", motion="unicycle", sensor=HALF_BLIND, sensing="{every: 2}",
-            rest="noise_on: robot",
+            route="{type: wander, turn_radius_m: 0.5}", motion="unicycle", sensor=HALF_BLIND,
+            sensing="{every: 2, first: 1}", rest="noise_on: robot",
         ),
         [],
     ),

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.random import SeedSequence
 
-from kalmark.arrays import Array, Index
+from kalmark.arrays import Array, Flags, Index
 from kalmark.association import ByIdentity
 from kalmark.campaign.scoring import SERIES, Scores, scores_of
 from kalmark.compiled import address_of, by_address, compiled, signature_of
@@ -38,7 +38,7 @@ from kalmark.models.sensors import RangeBearing
 from kalmark.results.measures import MAP_NEES, in_log, map_nees
 from kalmark.simulate.robots import Chance, drawn_start, scenery_of
 from kalmark.simulate.routes import Constant, Drive
-from kalmark.simulate.sights import POINTS, SimulatedSensing, Things, chosen
+from kalmark.simulate.sights import POINTS, SimulatedSensing, Things, chosen, noisy, possible
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
@@ -60,7 +60,8 @@ call_predict, call_correct = by_address(PREDICT), by_address(CORRECT)
 
 # of ranges and bearings: sigma_range_m, sigma_range_rel, sigma_bearing_rad, scale and bias_m
 Noise = tuple[float, float, float, float, float]
-Sightings = tuple[Index, Index, Array]  # numbers of steps or where each step begins, the points (N,), and y (N, 2)
+InSight = tuple[Index, Index, Array, Array]  # as `in_sight` returns
+Sightings = tuple[Index, Index, Index, Array, Array]  # as `by_landmark` returns
 
 
 def noise_of(sensor: RangeBearing) -> Noise:
@@ -186,45 +187,52 @@ def driven(
 
 
 @compiled
-def in_sight(
-    states: Array, at: Array, points: Array, every: int, limits: tuple[float, float, float], most: int
-) -> Sightings:  # fmt: skip
-    """Return what a sensor at `at` (3,) sees: the steps (N,), the points (N,), exact ranges and bearings (N, 2).
+def in_sight(states: Array, at: Array, points: Array, scans: Index, limits: tuple[float, float, float]) -> InSight:
+    """Return what a sensor at `at` (3,) sees at the steps `scans`: steps (N,), points (N,) and their distances (N,).
 
-    `limits` are the least and the greatest range and half of the field of view; of each scan the nearest `most`.
+    Last is where the points are in the sensor's frame (N, 2).  `limits` are the least and the greatest range and half
+    of the field of view.
     """
     least, greatest, half = limits
-    size, total = len(points), 0
-    steps, things = np.empty((len(states) - 1) * size, np.int64), np.empty((len(states) - 1) * size, np.int64)
-    y, near, p = np.empty((len(steps), 2)), np.empty(size, np.int64), np.empty((size, 3))
-    for k in range(every - 1, len(states) - 1, every):
+    most, total = len(scans) * len(points), 0
+    steps, numbers = np.empty(most, np.int64), np.empty(most, np.int64)
+    distance, v = np.empty(most), np.empty((most, 2))
+    for k in scans:
         T = compose(states[k + 1], at)[0]
         c, s = math.cos(T[2]), math.sin(T[2])
-        count = 0
-        for i in range(size):
+        for i in range(len(points)):
             d_x, d_y = points[i, 0] - T[0], points[i, 1] - T[1]
-            x, y_ahead = c * d_x + s * d_y, c * d_y - s * d_x
-            distance = math.sqrt(x * x + y_ahead * y_ahead)
-            if least <= distance <= greatest and (half >= math.pi or abs(math.atan2(y_ahead, x)) <= half):
-                near[count], p[count, 0], p[count, 1], p[count, 2] = i, x, y_ahead, distance
-                count += 1
-        for a in range(count):
-            nearer = 0
-            for b in range(count if count > most else 0):
-                nearer += p[b, 2] < p[a, 2] or (p[b, 2] == p[a, 2] and b < a)
-            if nearer < most:
-                steps[total], things[total] = k, near[a]
-                y[total, 0], y[total, 1] = p[a, 2], math.atan2(p[a, 1], p[a, 0])
+            x, y = c * d_x + s * d_y, c * d_y - s * d_x
+            away = math.sqrt(x * x + y * y)
+            if least <= away <= greatest and (half >= math.pi or abs(math.atan2(y, x)) <= half):
+                steps[total], numbers[total], distance[total], v[total, 0], v[total, 1] = k, i, away, x, y
                 total += 1
-    return steps[:total], things[:total], y[:total]
+    return steps[:total], numbers[:total], distance[:total], v[:total]
+
+
+@compiled
+def nearest(steps: Index, distance: Array, most: int) -> Flags:
+    """Return which of what is seen, at `steps` (N,) in order, is among the `most` nearest of its step.
+
+    Of those that are as near, the first.
+    """
+    near, first, last = np.empty(len(steps), np.bool_), 0, 0
+    for i in range(len(steps)):
+        if i == last:
+            first, last = i, np.searchsorted(steps, steps[i], side="right")
+        nearer = 0
+        for j in range(first, last):
+            nearer += (distance[j] < distance[i]) | ((distance[j] == distance[i]) & (j < i))
+        near[i] = nearer < most
+    return near
 
 
 def reported(
-    world: World, sensing: SimulatedSensing, things: Things, noise: Noise, chance: Chance, seen: Sightings
+    world: World, sensing: SimulatedSensing, things: Things, sensor: RangeBearing, chance: Chance, seen: InSight
 ) -> Sightings:
     """Return what is reported of all that is seen, with noise: as `sights.chosen`, `faulty`, `noisy` and `possible`."""
-    steps, numbers, e = seen
-    rows, normals = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    steps, numbers, _, v = seen
+    rows, measured = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
     for kept in reports(world, things, seen, chance):
         if sensing.dropouts:
             late = steps[kept] + 1 >= sensing.faults_from_step
@@ -232,33 +240,39 @@ def reported(
             lost[late] = chance.faults.random(int(late.sum())) < sensing.dropouts
             kept = kept[~lost]  # noqa: PLW2901
         rows.append(kept)
-        normals.append(chance.sight.standard_normal((len(kept), 2)))
-    of, n = np.concatenate(rows), np.concatenate(normals)
-    sigma_m, rel, sigma_rad, scale, bias_m = noise
-    y = e[of]
-    y[:, 0] = scale * y[:, 0] + bias_m
-    y[:, 0] += np.sqrt(sigma_m**2 + (rel * y[:, 0]) ** 2) * n[:, 0]
-    y[:, 1] = wrap(y[:, 1] + np.sqrt(sigma_rad**2) * n[:, 1])
-    possible = y[:, 0] >= 0
-    of, y = of[possible], y[possible]
-    return np.searchsorted(steps[of], np.arange(world.steps + 1)), numbers[of], y
+        measured.append(noisy(sensor, sensor.expect(v[kept])[0], chance.sight))
+    of, y = np.concatenate(rows), np.concatenate(measured)
+    there = possible(sensor, y)
+    return by_landmark(world.steps, steps[of[there]], things.values, numbers[of[there]], y[there])
 
 
-def reports(world: World, things: Things, seen: Sightings, chance: Chance) -> Iterator[Index]:
+def by_landmark(count: int, steps: Index, points: Array, numbers: Index, y: Array) -> Sightings:
+    """Return measurements y (N, 2) of points at `count` steps, in each step those of new landmarks last.
+
+    That is where each step begins (count + 1,), where its new ones do (count,), the places of landmarks in the state
+    (N,), y (N, 2) and where the landmarks are (L, 2), in the order in which they are seen first.
+    """
+    found, first = np.unique(numbers, return_index=True)
+    order, place, new = found[np.argsort(first)], np.zeros(len(points), np.int64), np.zeros(len(numbers), np.bool_)
+    place[order], new[first] = np.arange(len(order)) + 1, True
+    rows = np.lexsort((new, steps))
+    begins = np.searchsorted(steps, np.arange(count + 1))
+    middle = begins[1:] - np.bincount(steps[new], minlength=count)
+    return begins, middle, place[numbers[rows]], y[rows], points[order]
+
+
+def reports(world: World, things: Things, seen: InSight, chance: Chance) -> Iterator[Index]:
     """Yield rows of what is seen that are reported, many steps at once: alone are those that start new landmarks.
 
     These draw from the same source of chance as the noise does.
     """
-    steps, numbers, y = seen
+    steps, numbers, distance, _ = seen
     rows, at = np.arange(len(steps)), 0
+    if world.max_per_scan is not None:
+        rows = rows[nearest(steps, distance, world.max_per_scan)]
     if world.new_per_step is None:
         yield rows
         return
-    if world.max_per_scan is not None:
-        order = np.lexsort((y[:, 0], steps))
-        rank = np.empty_like(order)
-        rank[order] = rows - np.searchsorted(steps, steps[order])
-        rows = rows[rank < world.max_per_scan]
     while at < len(steps):
         unseen = np.flatnonzero(~things.seen[numbers[at:]])
         k = steps[at + unseen[0]] if len(unseen) else world.steps
@@ -266,7 +280,7 @@ def reports(world: World, things: Things, seen: Sightings, chance: Chance) -> It
         yield rows[slice(*np.searchsorted(rows, (at, here)))]
         if then > here:
             some = slice(here, then)
-            told = chosen(things, numbers[some], y[some, 0], world.new_per_step, world.max_per_scan, chance.sight)
+            told = chosen(things, numbers[some], distance[some], world.new_per_step, world.max_per_scan, chance.sight)
             yield here + told
         at = then
 
@@ -320,39 +334,26 @@ def start(
 
 
 @compiled
-def known_ones(slot_of: Index, things: Index, y: Array) -> tuple[Index, Array]:
-    """Return the slots (K,) and the measurements (K, 2) of those observations whose landmarks have a slot."""
-    count = 0
-    for i in range(len(things)):
-        count += slot_of[things[i]] >= 0
-    slots, y_known, to = np.empty(count, np.int64), np.empty((count, 2)), 0
-    for i in range(len(things)):
-        if slot_of[things[i]] >= 0:
-            slots[to], y_known[to, 0], y_known[to, 1] = slot_of[things[i]], y[i, 0], y[i, 1]
-            to += 1
-    return slots, y_known
-
-
-@compiled
 def filtered(
     ways: tuple[int, int, int], routines: corrections.Routines, view: Any, motion: tuple[int, Array],
     tables: tuple[Table, Table, int], started: tuple[Array, Array], controls: tuple[Array, Array, Array, Array, bool],
     sightings: Sightings, sensed: tuple[Array, Noise],
-    rules: tuple[float, int, float], scored: tuple[int, bool, Array, Array],
-) -> tuple[bool, Array, Array, Array, Array, Index, float, int]:  # fmt: skip
+    rules: tuple[float, int, float], scored: tuple[int, bool, Array],
+) -> tuple[bool, Array, Array, Array, Array, float, int]:  # fmt: skip
     """Filter a run: predict, correct and start landmarks step by step, as `Slam.process` does with known ids.
 
     `ways` are the addresses of the prediction, the correction and the generator, `tables` the blocks and the atoms of a
     robot and all landmarks and the capacity of a covariance, `controls` u (steps, m), seconds (steps,), the covariance
     N of a control's error, the diffusion (3 or 0, .) a second and whether controls are held, `sensed` the mount and
-    its noise, `rules` the gate and the limits of the iterations, `scored` `map_every` and what `score_map` takes.
+    its noise, `rules` the gate and the limits of the iterations, `scored` how often `score_map` scores, its `turns` and
+    the true states (steps + 1, 3).
 
     Returns whether all went well, the pose (steps, 3) after each scan and its covariance, the scores of the map
-    (steps, 6), the mean in the end, the numbers of the landmarks in it, the sum of d2 and how many were fused.
+    (steps, 6), the mean in the end, the sum of d2 and how many were fused.
     """
     blocks, atoms, capacity = tables
     u, dt_s, N, density, held = controls
-    first, things, y = sightings
+    first, new, slots, y, places = sightings
     at, noise = sensed
     steps, axes, robot, mount, d, never = len(u), 1, 0, -1, 2, False
     no_effect = np.empty((u.shape[1], 0))
@@ -360,36 +361,33 @@ def filtered(
     x[:3] = x_first[:3] = started[0]
     P[:3, :3] = started[1]
     mean, cov, scores = np.full((steps, 3), np.nan), np.full((steps, 3, 3), np.nan), np.full((steps, 6), np.nan)
-    slot_of, order = np.full(len(blocks), -1), np.empty(len(blocks), np.int64)
     none, nothing, count, nis, fused, ok = np.empty(0, np.int64), np.zeros((0, 0)), 0, 0.0, 0, True
     for k in range(steps):
-        low, high = first[k], first[k + 1]
+        low, middle, high = first[k], new[k], first[k + 1]
         if held and k == steps - 1 and high == low:
             break  # no later event asks where the robot is
         n = 3 + 2 * count
         D = density * dt_s[k] if len(density) and u[k].any() else nothing
         map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
         ok = call_predict(ways[0], (map_, (motion, robot, none, never, no_effect, u[k], N, D, dt_s[k]), never, never))
-        slots, y_known = known_ones(slot_of, things[low:high], y[low:high])
-        if ok and len(slots):
+        if ok and middle > low:
             whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines
-            scan = robot, mount, slots, d, y_known, noises(x, slots, at, noise), rules[0]
+            known = slots[low:middle]
+            scan = robot, mount, known, d, y[low:middle], noises(x, known, at, noise), rules[0]
             _e, _z, _Z, d2, near, ok = call_correct(ways[1], (view, whole, scan, (rules[1], rules[2])))
-            for i in range(len(slots)):
+            for i in range(len(known)):
                 nis += d2[i] if near[i] else 0.0
                 fused += near[i]
         if not ok:
             break
-        for i in range(low, high if len(slots) < high - low else low):
-            if slot_of[things[i]] < 0:
-                order[count], slot_of[things[i]] = things[i], count + 1
-                start(x, x_first, P, 3 + 2 * count, at, y[i : i + 1], noise)
-                count += 1
+        for i in range(middle, high):
+            start(x, x_first, P, 3 + 2 * count, at, y[i : i + 1], noise)
+            count += 1
         if high > low:
             keep_pose(x, P, mean[k], cov[k])
             if (k + 1) % scored[0] == 0 or k == steps - 1:
-                scores[k] = score_map(x, P, order[:count], scored[1], scored[2][k + 1], scored[3])
-    return ok, mean, cov, scores, x, order[:count], nis, fused
+                scores[k] = score_map(x, P, places[:count], scored[1], scored[2][k + 1])
+    return ok, mean, cov, scores, x, nis, fused
 
 
 # ---------------------------------------------------------------------- scores
@@ -403,19 +401,19 @@ def keep_pose(x: Array, P: Array, mean: Array, cov: Array) -> None:
 
 
 @compiled
-def score_map(x: Array, P: Array, order: Index, turns: bool, truth: Array, points: Array) -> Array:
+def score_map(x: Array, P: Array, places: Array, turns: bool, truth: Array) -> Array:
     """Return the NEES of the map (6,), as `map_nees`.
 
-    `turns`: errors are in the invariant filter's coordinates.  `truth` is the true state (3,) of the robot, `points`
-    where the landmarks truly are.
+    `turns`: errors are in the invariant filter's coordinates.  `truth` is the true state (3,) of the robot, `places`
+    (B, 2) where the landmarks truly are.
     """
-    a, d = wrap(truth[2] - x[2]), np.empty((2, 3 + 2 * len(order)))
+    a, d = wrap(truth[2] - x[2]), np.empty((2, 3 + 2 * len(places)))
     d[0, 2] = d[1, 2] = a
-    for i in range(len(order) + 1):
-        j, true = (2 * i + 1, points[order[i - 1]]) if i else (0, truth[:2])
+    for i in range(len(places) + 1):
+        j, true = (2 * i + 1, places[i - 1]) if i else (0, truth[:2])
         d[1, j], d[1, j + 1] = true[0] - x[j], true[1] - x[j + 1]
         d[0, j], d[0, j + 1] = in_log(a if turns else 0.0, d[1, j], d[1, j + 1])
-    return map_nees(d, P, 3 + 2 * np.arange(len(order)), np.full(len(order), 2))
+    return map_nees(d, P, 3 + 2 * np.arange(len(places)), np.full(len(places), 2))
 
 
 # ---------------------------------------------------------------------- runs
@@ -476,7 +474,8 @@ class Engine:
         motion, sensor = self.robot.motion, self.mount.sensor
         self.motion, self.kind = step_of(motion), MOTIONS.index(type(motion))
         assert isinstance(motion, MOTIONS) and isinstance(sensor, RangeBearing)
-        self.noise, self.at = noise_of(sensor), np.array(self.mount.at)
+        self.scans = np.flatnonzero([*map(self.sensing.scans_at, range(1, world.steps + 1))])
+        self.at, self.sensor = np.array(self.mount.at), sensor
         self.limits = sensor.range_min_m, sensor.range_max_m, sensor.fov_rad / 2
 
     def run(self, seed: SeedSequence, map_every: int) -> dict[str, Scores] | None:
@@ -489,12 +488,11 @@ class Engine:
         if driven_ is None:
             return None
         states, u = driven_
-        most = self.landmarks if world.max_per_scan is None or world.new_per_step else world.max_per_scan
-        seen = in_sight(states, self.at, things.values, self.sensing.every or 1, self.limits, most)
-        sightings = reported(world, self.sensing, things, self.noise, chance, seen)
+        seen = in_sight(states, self.at, things.values, self.scans, self.limits)
+        sightings = reported(world, self.sensing, things, self.sensor, chance, seen)
         scores = {}
         for label, one in self.filters.items():
-            score = self._filter(one, states, u, sightings, things.values, map_every)
+            score = self._filter(one, states, u, sightings, map_every)
             if score is None:
                 return None
             scores[label] = score
@@ -535,13 +533,11 @@ class Engine:
             dt_s[0] = 0.0
         return dt_s
 
-    def _filter(
-        self, f: _Filter, states: Array, u: Array, sightings: Sightings, points: Array, map_every: int
-    ) -> Scores | None:
+    def _filter(self, f: _Filter, states: Array, u: Array, sightings: Sightings, map_every: int) -> Scores | None:
         """Filter and score a run; None if the filter diverges."""
         N, density, held = f.control
-        scored = map_every, f.coordinates == "log", states, points
-        ok, mean, P, of_map, x, order, nis, fused = filtered(
+        scored = map_every, f.coordinates == "log", states
+        ok, mean, P, of_map, x, nis, fused = filtered(
             f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
             (u, self._seconds, N, density, held), sightings, f.sensed, f.rules, scored,
         )  # fmt: skip
@@ -550,6 +546,6 @@ class Engine:
         series = {key: np.full((1, len(u)), np.nan) for key in SERIES}
         for i, key in enumerate(MAP_NEES):
             series[key][0] = of_map[:, i]
-        place = x[3 : 3 + 2 * len(order)].reshape(-1, 2)
-        found = place, points[order], len(order), len(order)
+        places = sightings[-1]
+        found = x[3 : 3 + places.size].reshape(-1, 2), places, len(places), len(places)
         return scores_of(series, mean[None], P[None], states[None, 1:], f.coordinates, found, nis, 2 * fused, "")
