@@ -231,3 +231,23 @@ def test_a_run_with_every_option_is_the_same_map_by_the_command_line_and_after_l
         np.testing.assert_array_equal(other.covariance(*names), slam.covariance(*names), folder)
         for name in names:
             np.testing.assert_array_equal(other.mean(name), slam.mean(name), folder)
+
+
+def test_options_of_a_log_and_landmarks_added_in_python_are_in_the_configuration_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("kalmark.compiled.say_compiling", lambda: None)
+    write_log(tmp_path / "log", {"r": ["s"]}, {"s": ("range_m", "bearing_rad")})
+    options = {"from_s": 0.3, "to_s": 1.9, "factors": {"v_mps": 1.1}, "shift_s": {"s": 0.01}}
+    log = km.open_log(tmp_path / "log", **options)  # type: ignore[arg-type]
+    assert log.options == options | {"on_error": "raise", "ids": "given", "increments": "recorded"}
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle(), sensors={"s": km.Mount(SENSORS[0])})])
+    slam.add_landmark(0, PLACES[0], random_covariance(2))
+    slam.add_landmark("post", (1.0 / 3.0, 7.0))
+    km.record(slam, log, progress=False).save(tmp_path / "run")
+    km.Run.load(tmp_path / "run").save(tmp_path / "copy")
+    assert main(["run", str(tmp_path / "copy" / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
+    texts = [(tmp_path / folder / "landmarks.csv").read_text() for folder in ("run", "copy", "again")]
+    assert texts[0] == texts[1] == texts[2]
+    assert "post,point,0.3333333333333333,7.0" in texts[2]
+    np.testing.assert_array_equal(km.Slam.load(tmp_path / "again" / "map.kmk").mean("r"), slam.mean("r"))

@@ -83,6 +83,12 @@ def open_log(
     refuse_overflow(log)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m, sigma_fixes_z_m)
     log = selected(log, request, from_s, to_s, ids)
+    chosen = {
+        "from_s": from_s, "to_s": to_s, "on_error": on_error, "ids": ids, "factors": factors, "shift_s": shift_s,
+        "truth": _names(log, "truth", truth), "fixes": _names(log, "fixes", fixes), "sigma_fixes_m": sigma_fixes_m,
+        "sigma_fixes_z_m": sigma_fixes_z_m, "increments": increments, **options,
+    }  # fmt: skip
+    log = replace(log, options={name: value for name, value in chosen.items() if value is not None})
     return cut(log) if choice(increments, "increments", ("recorded", "cut")) == "cut" else log
 
 
@@ -146,6 +152,11 @@ def _by_robot(log: Log, name: str, given: Any) -> dict[str, Path]:
             wanted = f"a file, or one for each of the robots {', '.join(log.robots)}: {{robot: file}}"
             raise LogError(f"log option {name} is {shown(given)}, expected {wanted}")
     return {robot: find_data(path) for robot, path in files.items()}
+
+
+def _names(log: Log, name: str, given: Any) -> dict[str, str] | None:
+    """Return the names of the files of an option by robot, None if it is not given."""
+    return {robot: str(path.resolve()) for robot, path in _by_robot(log, name, given).items()} or None
 
 
 def _dimensions(log: Log, robot: str) -> int:

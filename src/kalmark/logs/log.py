@@ -125,6 +125,7 @@ class Log:
     `describes` is what the source itself says of the rig, its calibration, mounts, noise and start, in the shape of
     a configuration, which may overrule it.  `reference` has figures of other programs on this log, by program, named
     as in ``summary.json``.  `true_ids` has the landmarks of scans whose ids are hidden, to score the association.
+    `options` are those it was opened with, as the section `log` of a configuration has them.
     """
 
     name: str
@@ -143,6 +144,7 @@ class Log:
     reference: dict[str, dict[str, float]] = field(default_factory=dict)
     true_ids: dict[Scan, tuple[Id | None, ...]] = field(default_factory=dict)
     origin: Array | None = None
+    options: dict[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         span = f" in {(self.events[-1].t_ns - self.events[0].t_ns) * 1e-9:.1f} s" if self.events else ""

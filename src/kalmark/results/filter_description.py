@@ -28,17 +28,22 @@ HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has 
 USED = ("associated", "new")
 
 
-def configuration(slam: Slam, log: Log) -> dict[str, Any]:
-    """Return the configuration that makes the run of a log by a Slam again: its plugins, the log, the filter."""
+def configuration(slam: Slam, log: Log, known: str | None = None) -> dict[str, Any]:
+    """Return the configuration that makes the run of a log by a Slam again: its plugins, the log, the filter.
+
+    `known` is the file of the landmarks that were in the map before the first event.
+    """
     said: dict[str, Any] = {}
     mounts = [mount for robot in slam.robots.values() for mount in robot.sensors.values()]
     models = [each for part in (slam.state.settings, *slam.robots.values(), *mounts) for each in vars(part).values()]
     own: list[Any] = [type(each) for each in models if not isinstance(each, np.ndarray | np.generic)]
     if log.path is not None:
-        said["log"] = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)}
+        said["log"] = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
         own += [FORMATS[log.format].read] if log.format in FORMATS else []
     plugins = sorted({str(file) for each in own if (file := plugin_of(each)) is not None})
-    return ({"plugins": plugins} if plugins else {}) | said | describe(slam)
+    described = describe(slam)
+    described["map"] |= {} if known is None else {"known": known}
+    return ({"plugins": plugins} if plugins else {}) | said | described
 
 
 @runtime_checkable

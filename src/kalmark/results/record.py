@@ -33,7 +33,7 @@ from kalmark.results.history import (
     texts,
 )
 from kalmark.results.landmark_table import MapLandmarks
-from kalmark.results.recording import LogReference
+from kalmark.results.recording import KNOWN, LogReference
 from kalmark.results.repeated_landmarks import repeated
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
@@ -146,6 +146,7 @@ class _Recorder:
         )
         surveyed = slam.landmarks() if slam.t_ns is None else ()  # in a map that is resumed they are correlated
         self.priors = tuple(Prior(str(l.id), np.array(l.mean), np.array(l.covariance)) for l in surveyed)
+        self.known = MapLandmarks.of(slam).to_csv() if len(surveyed) else ""
         self.controls: dict[str, Controlled] = {}
         self.reckoned = {name: DeadReckoning(robot) for name, robot in slam.robots.items()}
         self.dead: list[Array] = []
@@ -235,7 +236,7 @@ class _Recorder:
         history = self._history()
         return Run(
             history=history,
-            config=dict(config) if config is not None else configuration(slam, log),
+            config=dict(config) if config is not None else configuration(slam, log, KNOWN if self.known else None),
             landmarks=MapLandmarks.of(slam),
             truth=Truth.of(log, history, self.anchored),
             log=LogReference(log.name, log.format, None if log.path is None else str(log.path), tuple(log.robots)),
@@ -246,6 +247,7 @@ class _Recorder:
             slam=slam,
             source=log,
             reference=plain(log.reference),
+            known="" if config is not None else self.known,
         )
 
     def _history(self) -> History:
