@@ -1,8 +1,8 @@
 """Looks of a sensor at the landmarks about it, and its detection probability over the field of view, counted in them.
 
-A look is a scan from another pose than the last one: scans in a row miss a landmark for the same reason.  The detection
-probability depends on the range, the bearing and on objects that stand nearer; each is counted
-by itself, so that a chance where little is seen (beyond the reach of a detector, behind a tree) counts for little.
+A look is a scan from another pose than the last one, or after many from one pose: scans in a row miss a landmark for
+the same reason.  The detection probability depends on the range, the bearing and on objects that stand nearer; each is
+counted by itself, so that a chance where little is seen (beyond a detector's reach, behind a tree) counts for little.
 """
 
 from __future__ import annotations
