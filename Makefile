@@ -13,7 +13,7 @@ test: $(VENV)/test.stamp
 
 # the oldest versions that pyproject.toml allows
 lowest: $(VENV)-lowest/stamp
-	$(VENV)-lowest/bin/python -m pytest -q tests/test_config.py tests/slam/test_slam.py tests/logs/test_logs_tables.py tests/logs/test_logs_bags_files.py tests/cli/test_cli.py
+	$(VENV)-lowest/bin/python -m pytest -q tests/test_config.py tests/slam/test_slam.py tests/logs/test_logs_tables.py tests/bags/test_bags_files.py tests/cli/test_cli.py
 
 lint: $(VENV)/test.stamp
 	$(BIN)/ruff check .

@@ -24,16 +24,16 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.bags.first_config import first_config
+from kalmark.bags.run_messages import export
+from kalmark.bags.survey import survey
+from kalmark.bags.tagslam import SIGMA, Scene, frame_of, read_cameras, read_scene
 from kalmark.config import build_slam, open_run
 from kalmark.events import Scan
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs import Log, find_data, open_log
-from kalmark.logs.bag.first_config import first_config
-from kalmark.logs.bag.survey import survey
 from kalmark.logs.source import seconds
-from kalmark.logs.tagslam import SIGMA, Scene, frame_of, read_cameras, read_scene
-from kalmark.results.mcap import export
 from kalmark.results.record import record
 from kalmark.slam.slam import Slam
 

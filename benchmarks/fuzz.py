@@ -122,8 +122,8 @@ def bag(name: str) -> Callable[[bytes, Path], None]:
     """Return what reads a bag by topic, and what makes its first configuration."""
 
     def take(data: bytes, folder: Path) -> None:
-        from kalmark.logs.bag.first_config import first_config
-        from kalmark.logs.bag.survey import survey
+        from kalmark.bags.first_config import first_config
+        from kalmark.bags.survey import survey
 
         path = written(folder / "log", {name: data}) / name
         first_config(survey(path))
@@ -266,7 +266,7 @@ def a_map() -> bytes:
 
 def a_log(parquet_: bool) -> bytes:
     """Return the scans of a log as Parquet, or the whole as MCAP."""
-    from kalmark.results.mcap import export
+    from kalmark.bags.run_messages import export
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -284,7 +284,7 @@ def a_bag(ros1: bool) -> bytes:
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
 
-    from kalmark.logs.bag.mcap_writer import Types, header
+    from kalmark.bags.mcap_writer import Types, header
 
     types_ = Types(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE))
     encode = types_.store.serialize_ros1 if ros1 else types_.store.serialize_cdr

@@ -24,12 +24,12 @@ from scipy.stats import chi2
 
 import kalmark as km
 from kalmark.config import build_slam, open_run
+from kalmark.datasets.victoria_park import ANTENNA, ROBOT
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.events import Event, order
 from kalmark.filter.kernels import one_thread
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log
-from kalmark.logs.victoria_park import ANTENNA, ROBOT
 from kalmark.results.record import record
 
 BIAS_RADPS, GYRO_RADPS = np.radians(0.1), 0.005

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.bags.mcap_writer import Outgoing, Types, header
 from kalmark.events import Control, Event, Scan
 from kalmark.logs import Log, open_log
-from kalmark.logs.bag.mcap_writer import Outgoing, Types, header
 from kalmark.logs.geodesy import earth_centred
 from laser_worlds import LaserWorld
 

@@ -15,7 +15,7 @@ from kalmark.config import load_config, open_run, resolve_config, shipped_config
 from kalmark.config.schema import options_of_formats
 from kalmark.config.tree import name_of, name_on
 from kalmark.errors import ConfigError
-from kalmark.logs import FORMATS
+from kalmark.logs import known_formats
 
 GOOD = """\
 log: {path: my_log, robots: [3]}
@@ -309,9 +309,9 @@ def test_a_start_of_space_may_have_a_sigma_for_each_axis(tmp_path: Path) -> None
 
 
 def test_every_option_of_a_log_format_is_a_key_with_its_line_of_documentation() -> None:
-    options = {option for entry in FORMATS.values() for option in entry.options}
-    assert options <= set(options_of_formats(tuple(FORMATS.values())).model_fields)
-    assert all(option.text for entry in FORMATS.values() for option in entry.options.values())
+    options = {option for entry in known_formats().values() for option in entry.options}
+    assert options <= set(options_of_formats(tuple(known_formats().values())).model_fields)
+    assert all(option.text for entry in known_formats().values() for option in entry.options.values())
 
 
 def test_a_file_is_called_by_its_name_or_by_its_folder_if_all_such_files_have_that_name() -> None:

@@ -16,7 +16,7 @@ import pytest
 
 from kalmark.cli.app import app
 from kalmark.declare import built_in, is_own, world_of_class
-from kalmark.logs import FORMATS
+from kalmark.logs import known_formats
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -59,7 +59,7 @@ ROLES = {  # what a row of CONTRIBUTING is about, and where that is
     "a landmark in the plane": lambda: classes_of("landmark", "plane"),
     "a landmark in space": lambda: classes_of("landmark", "space"),
     "a motion": lambda: classes_of("motion"),
-    "a log format": lambda: [one.read for one in FORMATS.values() if is_own(one.read)],
+    "a log format": lambda: [one.read for one in known_formats().values() if is_own(one.read)],
     "an estimator": lambda: classes_of("estimator"),
     "an association": lambda: classes_of("association"),
     "a verb": lambda: [command.callback for command in app.registered_commands if not command.hidden],

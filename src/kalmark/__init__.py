@@ -13,7 +13,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from kalmark.errors import KalmarkError
+from kalmark.errors import KalmarkError, PluginError
+from kalmark.plugins import found, load
 
 if TYPE_CHECKING:
     from kalmark import association, detect, geometry, vision
@@ -53,11 +54,9 @@ _MODULES = {
     "motion": "kalmark.models.motion",
     "presets": "kalmark.presets",
     "sensors": "kalmark.models.sensors",
-    "vision": "kalmark.vision",
 }
 _NAMES = {
     "kalmark.declare": ("register",),
-    "kalmark.diagnosis.verdict": ("Verdict", "diagnose"),
     "kalmark.events": ("Control", "Fix", "Frame", "Scan"),
     "kalmark.logs": ("Log", "log_from", "open_log", "stream_log"),
     "kalmark.management.attention": ("Attention",),
@@ -76,9 +75,20 @@ def __getattr__(name: str) -> Any:
     """Import a name on its first use: the compiled models take a second that `kalmark --help` need not wait."""
     home = _MODULES.get(name) or next((module for module, names in _NAMES.items() if name in names), None)
     if home is None:
-        raise AttributeError(f"module 'kalmark' has no attribute {name!r}")
+        return _of_plugin(name)
     module: Any = import_module(home)
     globals()[name] = module if name in _MODULES else vars(module)[name]
+    return globals()[name]
+
+
+def _of_plugin(name: str) -> Any:
+    """Return what a plug-in adds under a name.  Raises AttributeError."""
+    if name not in found("names"):
+        raise AttributeError(f"module 'kalmark' has no attribute {name!r}")
+    try:
+        globals()[name] = load("names", name)
+    except PluginError as error:
+        raise AttributeError(str(error)) from None
     return globals()[name]
 
 

@@ -26,9 +26,10 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 
 import numpy as np
 
-from kalmark.errors import KalmarkError, ModelError
+from kalmark.errors import KalmarkError, ModelError, PluginError
 from kalmark.events import bound, most, shown
 from kalmark.geometry.spaces import Space
+from kalmark.plugins import load_all
 
 Class = TypeVar("Class", bound=type)
 
@@ -297,10 +298,8 @@ def world_of_class(model: Any) -> str:
 
 def classes(role: str, world: str = "") -> dict[str, list[type]]:
     """Return the classes of a role by name, of a world or, for "", of all: those of space last."""
-    fitting = {
-        name: [model for model in models if world in ("", world_of_class(model)) or not world_of_class(model)]
-        for name, models in _CLASSES.get(role, {}).items()
-    }
+    missing_models()
+    fitting = {name: classes_of(role, name, world) for name in _CLASSES.get(role, {})}
     found = [(name, models) for name, models in fitting.items() if models]
     return dict(sorted(found, key=lambda each: world_of_class(each[1][0]) == "space"))
 
@@ -312,8 +311,31 @@ def built_in(role: str) -> tuple[Any, ...]:
 
 def class_of(role: str, name: str, world: str = "") -> type:
     """Return the class of a name, of a world where the name stands for two.  Raises KeyError."""
-    models = _CLASSES[role][name]
+    models = classes_of(role, name)
     return next((model for model in models if world in ("", world_of_class(model))), models[0])
+
+
+def classes_of(role: str, name: str, world: str = "") -> list[type]:
+    """Return the classes of a name, of a world or, for "", of all; plug-ins are loaded if the core has none.
+
+    Raises KeyError if no class has this name.
+    """
+    if not _fitting(role, name, world):
+        missing_models()
+    if name not in _CLASSES.get(role, {}):
+        raise KeyError(name)
+    return _fitting(role, name, world)
+
+
+def _fitting(role: str, name: str, world: str) -> list[type]:
+    models = _CLASSES.get(role, {}).get(name, ())
+    return [model for model in models if world in ("", world_of_class(model)) or not world_of_class(model)]
+
+
+@cache
+def missing_models() -> tuple[PluginError, ...]:
+    """Load the models of all plug-ins, and return the errors of those that cannot be loaded."""
+    return tuple(load_all("models")[1].values())
 
 
 def registered_name(model: type) -> str | None:

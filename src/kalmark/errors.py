@@ -45,6 +45,10 @@ class MapError(KalmarkError):
     """A block that is not in the map, or a map that cannot be read."""
 
 
+class PluginError(KalmarkError):
+    """A plug-in is not installed or cannot be loaded."""
+
+
 class LogError(KalmarkError):
     """A log that cannot be read.  The message starts with ``file:line:`` where there is one."""
 

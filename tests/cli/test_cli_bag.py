@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from command_line import Kalmark
+from kalmark.bags.first_config import first_config
+from kalmark.bags.survey import survey
 from kalmark.config import build_slam, load_config, open_run
 from kalmark.config.opening import open_config_log
 from kalmark.errors import LogError
 from kalmark.events import Control, Scan
 from kalmark.logs import open_log
-from kalmark.logs.bag.first_config import first_config
-from kalmark.logs.bag.survey import survey
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from command_line import Kalmark, write_log
+from kalmark.bags.mcap_writer import Types
+from kalmark.bags.run_messages import export
 from kalmark.config import build_slam, open_run
 from kalmark.events import Control, Fix, Scan, order
 from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
-from kalmark.logs.bag.mcap_writer import Types
-from kalmark.results.mcap import export
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from ros_bags import same_logs

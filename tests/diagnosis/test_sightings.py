@@ -11,8 +11,8 @@ import pytest
 from hall import hall, mapped
 
 import kalmark as km
+from kalmark.cli.run import VERDICT_OBSERVATIONS
 from kalmark.diagnosis import doubled_landmarks
-from kalmark.diagnosis.verdict import SHORT
 from kalmark.events import Control, Scan
 
 NEAR, FAR, POST = (5.0, 0.0), (5.2, 0.0), (0.0, 5.0)
@@ -117,7 +117,7 @@ def test_scans_that_are_late_are_named_before_the_map_that_they_double_by_the_ve
         Scan(t_ns=e.t_ns + 200_000_000, robot="rover", sensor="laser", y=e.y) if isinstance(e, Scan) else e
         for e in log.events
     ]
-    verdict = km.diagnose(mapped(replace(log, events=sorted(late, key=km.events.order))), SHORT)
+    verdict = km.diagnose(mapped(replace(log, events=sorted(late, key=km.events.order))), VERDICT_OBSERVATIONS)
     names = [cause.name for cause in verdict.causes]
     assert (verdict.map, names[0]) == ("wrong", "time_offset")
     assert "map_repeats" in names

@@ -10,11 +10,11 @@ import pytest
 
 from command_line import write_log
 from differences import derivative
+from kalmark.datasets.g2o import control
 from kalmark.errors import LogError
 from kalmark.events import Control, Fix, Scan
 from kalmark.geometry import frames3d, rotations
 from kalmark.logs import open_log
-from kalmark.logs.g2o import control
 from kalmark.logs.poses import in_space, read_path, tum_text, write_path
 from kalmark.logs.source import Request, raising
 

@@ -64,7 +64,7 @@ def test_times_are_selected_from_the_first_event_on(folder: Path) -> None:
         ({"to_s": -1}, "to_s is -1"),
         ({"bearing_shift_s": 0.1}, "'bearing_shift_s' is unknown to native, expected origin"),
         ({"on_error": "ignore"}, "on_error is 'ignore', expected one of raise, skip"),
-        ({"format": "nativ"}, "expected one of native, mrclam, .*did you mean 'native'"),
+        ({"format": "nativ"}, "expected one of native, carmen, .*did you mean 'native'"),
         ({"format": "mrclam"}, "not a log of format mrclam, expected a folder with Barcodes.dat"),
     ],
 )
@@ -76,7 +76,7 @@ def test_a_wrong_argument_says_what_was_expected(folder: Path, arguments: dict, 
 def test_an_unknown_folder_lists_the_formats_and_the_logs_below_it(folder: Path, tmp_path: Path) -> None:
     above = tmp_path / "above"
     above.mkdir()
-    with pytest.raises(LogError, match=r"no known log format, expected one of native: .*; mrclam: .*; dlr: "):
+    with pytest.raises(LogError, match=r"no known log format, expected one of native: .*; dlr: .*; mrclam: "):
         open_log(above)
     folder_below = above / "one"
     folder_below.mkdir()

@@ -17,7 +17,6 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-import kalmark
 from kalmark.campaign.replay import Look, Replay
 from kalmark.campaign.scoring import SERIES, Scores
 from kalmark.config.schema import Config
@@ -31,7 +30,7 @@ NUMBERS = ("landmark_rmse_m", "landmark_rmse_raw_m", "landmarks", "nis", "nis_do
 @cache
 def code_digest() -> str:
     """Return a digest of kalmark's sources: other code gives other numbers."""
-    digest, package = hashlib.sha256(), Path(kalmark.__file__).parent
+    digest, package = hashlib.sha256(), Path(__file__).parents[1]
     for source in sorted(package.rglob("*.py")):
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]

@@ -6,23 +6,21 @@ import errno
 import gc
 import sys
 from collections.abc import Sequence
-from importlib.metadata import entry_points, version
+from importlib.metadata import version
 from typing import Annotated
 
 import typer
 
-from kalmark.cli.bag import bag
 from kalmark.cli.campaign import campaign
 from kalmark.cli.check import check
 from kalmark.cli.convert import convert
-from kalmark.cli.diagnose import diagnose
 from kalmark.cli.folders import compare, evaluate, explain, report, view
 from kalmark.cli.live import live
 from kalmark.cli.logs import config, data, simulate, worlds
 from kalmark.cli.run import demo, run, warm_up
 from kalmark.cli.shared import say
-from kalmark.cli.tune import tune
 from kalmark.errors import KalmarkError
+from kalmark.plugins import load_all
 
 USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # no place for a file
@@ -43,8 +41,6 @@ for verb in (
     run,
     simulate,
     evaluate,
-    diagnose,
-    tune,
     report,
     view,
     compare,
@@ -52,7 +48,6 @@ for verb in (
     campaign,
     config,
     worlds,
-    bag,
     convert,
     check,
     warm_up,
@@ -60,11 +55,11 @@ for verb in (
 ):
     app.command()(verb)
 app.add_typer(data, name="data")
-for other in entry_points(group="kalmark.verbs"):  # of other packages; one that cannot be loaded stops no other verb
-    try:
-        app.command(other.name)(other.load())
-    except Exception as error:
-        say(f"kalmark: the verb {other.name!r} of {other.value} cannot be loaded: {error}", err=True)
+verbs, missing = load_all("verbs")
+for name, function in verbs.items():
+    app.command(name)(function)
+for failure in missing.values():
+    say(f"kalmark: the verb {failure}", err=True)
 
 
 def _show_version(wanted: bool) -> None:

@@ -9,12 +9,13 @@ import typer
 
 from kalmark.cli.shared import Trust, say, writable
 from kalmark.errors import KalmarkError
+from kalmark.plugins import found, load
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.results.run import Run
 
-MCAP, G2O, POSES = ".mcap", ".g2o", (".tum", ".kitti")
+G2O, POSES = ".g2o", (".tum", ".kitti")
 
 
 def convert(
@@ -36,7 +37,8 @@ def convert(
     """Write a log as a native one, a folder of CSV files; with its results as MCAP or g2o; a path as TUM or KITTI."""
     from kalmark.logs import write_native
 
-    if out.suffix in (MCAP, G2O, *POSES):
+    writes = out.suffix[1:] in found("writers")
+    if writes or out.suffix in (G2O, *POSES):
         if out.exists():
             raise KalmarkError(f"{out}: this file exists already, expected a new one")
         writable(out.parent)
@@ -48,10 +50,8 @@ def convert(
         return
     if out.suffix == G2O:
         _write_graph(out, source, log, run)
-    elif out.suffix == MCAP:
-        from kalmark.results.mcap import export
-
-        counts = export(out, log, run)
+    elif writes:
+        counts = load("writers", out.suffix[1:])(out, log, run)
         say(f"{out}: {sum(counts.values())} messages on {', '.join(sorted(counts))}")
     elif log is not None:
         write_native(log, out, parquet=parquet)

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kalmark.cli.shared import Overrides, computing, print_summary, say, slam_of, writable
-from kalmark.errors import KalmarkError, RunError
+from kalmark.errors import KalmarkError, PluginError, RunError
+from kalmark.plugins import load
 
 if TYPE_CHECKING:
     from kalmark.results.run import Run
 
 SHOWN = 5
+VERDICT_OBSERVATIONS = 3_000  # that the verdict at the end of a run takes
 
 
 class OnError(StrEnum):
@@ -110,10 +112,13 @@ def warm_up(
 
 
 def judge(result: Run) -> None:
-    """Put a short verdict into the summary of a run."""
-    from kalmark.diagnosis.verdict import SHORT, diagnose
-
-    diagnose(result, SHORT, progress=True)
+    """Put a short verdict into the summary of a run, if the plug-in for it is there."""
+    try:
+        diagnose = load("names", "diagnose")
+    except PluginError as error:
+        say(f"warning: no verdict: {error}", err=True)
+    else:
+        diagnose(result, VERDICT_OBSERVATIONS, progress=True)
 
 
 def finish(result: Run, out: Path, title: str) -> None:

@@ -23,8 +23,8 @@ from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Frame, Scan
 from kalmark.geometry.named_poses import pose_of, world_of
-from kalmark.logs import tagslam
-from kalmark.logs.images.image_files import size_of
+from kalmark.logs.formats import known_formats
+from kalmark.logs.image_files import size_of
 from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
 from kalmark.logs.log import Log
 from kalmark.models.inertial import Inertial, at_rest
@@ -75,8 +75,9 @@ def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
         return [KnownLandmark(name, place) for name, place in log.landmarks.items()]
     try:
         path = known_path(config)
-        if path.suffix in (".yaml", ".yml"):
-            return tagslam.surveyed(path, exact)
+        readers = {ending: read for entry in known_formats().values() for ending, read in entry.known_maps.items()}
+        if path.suffix in readers:
+            return readers[path.suffix](path, exact)
         return read_known(path, exact, None if log is None else log.origin)
     except LogError as error:
         raise config.error(("map", "known"), str(error)) from None

@@ -18,7 +18,7 @@ from kalmark.config import schema
 from kalmark.config.reading import shipped_configs
 from kalmark.config.sections import BASES, Section, section_of
 from kalmark.declare import classes, is_own, unit_of
-from kalmark.logs import FORMATS
+from kalmark.logs import known_formats
 
 HEAD = """\
 # Configuration
@@ -96,7 +96,7 @@ def _section(title: str, model: type[BaseModel], common: type[BaseModel] = Secti
 
 def _options() -> str:
     """Return the options of the formats of logs, each beside the defaults of its reader."""
-    declared = [(entry.name, option) for entry in FORMATS.values() for option in entry.options.values()]
+    declared = [(entry.name, option) for entry in known_formats().values() for option in entry.options.values()]
     rows = [f"| `{o.name}` | {name} | {_value(o.default)} | {o.unit} | {o.text} |" for name, o in declared]
     head = "## `log`, by format\n\nOptions of one format each.\n\n| key | format | default | unit | meaning |\n"
     return head + "\n".join(["|---|---|---|---|---|", *rows, ""])

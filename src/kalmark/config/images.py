@@ -13,7 +13,7 @@ from kalmark.config.sections import model_of
 from kalmark.config.tree import Tree
 from kalmark.events import Event, Frame
 from kalmark.logs.log import Log
-from kalmark.vision.straight import Straightened
+from kalmark.plugins import load
 
 TAKEN = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px", "mount")
 TAKERS = "pinhole", "segments"  # types of sensors that can take them
@@ -67,9 +67,9 @@ class Newest:
         return self.image
 
 
-def _cameras(config: Config, robot: str) -> dict[str, list[tuple[str, Straightened | None]]]:
+def _cameras(config: Config, robot: str) -> dict[str, list[tuple[str, Any]]]:
     """Return by camera the sensors that take its images, and how these are straightened, None if they are straight."""
-    found: dict[str, list[tuple[str, Straightened | None]]] = {}
+    found: dict[str, list[tuple[str, Any]]] = {}
     sensors: Mapping[str, Any] = config.robots[robot].sensors if robot in config.robots else {}
     for name, sensor in sensors.items():
         camera = getattr(sensor, "images", None)
@@ -85,6 +85,6 @@ def _cameras(config: Config, robot: str) -> dict[str, list[tuple[str, Straighten
         source, model = (model_of(sensors[of], "space") for of in (camera, name))
         numbers = [[getattr(of, key, None) for key in TAKEN[:-1]] for of in (source, model)]
         bent = numbers[0] != numbers[1] or bool(getattr(source, "distortion", None))
-        straight = Straightened(source, model.intrinsics, model.image) if bent else None
+        straight = load("names", "vision").Straightened(source, model.intrinsics, model.image) if bent else None
         found.setdefault(camera, []).append((name, straight))
     return found

@@ -13,7 +13,7 @@ from kalmark.config.schema import COMMON, TRUTH, Config
 from kalmark.config.tree import EACH, OVERRIDE, Tree, merged, read_tree, tree_of, with_each
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import Frame, Scan
-from kalmark.logs import FORMATS, find_data, open_log
+from kalmark.logs import find_data, known_formats, open_log
 from kalmark.logs.formats import recognise
 from kalmark.logs.log import Log
 
@@ -108,7 +108,7 @@ def open_config_log(config: Config, log_path: str | Path | None = None, *, progr
 def found_options(config: Config) -> dict[str, Any]:
     """Return the options of a configuration's log, with the files found that they name.  Raises LogError."""
     options = config.log.options()
-    for option in (option for entry in FORMATS.values() for option in entry.options.values()):
+    for option in (option for entry in known_formats().values() for option in entry.options.values()):
         ending = option.values.ending if option.values else ""
         if ending and option.name in options:
             given = options[option.name].items()
@@ -148,8 +148,8 @@ def find_log(config: Config, log_path: str | Path | None = None) -> Path:
 def check_format(config: Config, path: Path) -> None:
     """Refuse a format that does not exist and options that the log's format does not have."""
     name = config.log.format
-    if name is not None and name not in FORMATS:
-        message = f"got {name!r}, expected one of {', '.join(FORMATS)}{did_you_mean(name, [*FORMATS])}"
+    if name is not None and name not in known_formats():
+        message = f"got {name!r}, expected one of {', '.join(known_formats())}{did_you_mean(name, [*known_formats()])}"
         raise config.error(("log", "format"), message)
     entry, _ = recognise(path, name)
     for key, value in config.log.options().items():

@@ -128,7 +128,7 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
     value = _at(tree.values, path)
     if kind == "union_tag_invalid":
         path = (*path, "type")
-        message = _not_one_of(value.get("type"), context["types"], path)
+        message = _not_one_of(value.get("type"), context["types"], path) + context["missing"]
     elif kind == "literal_error":
         message = _not_one_of(value, re.findall(r"'([^']+)'", context["expected"]), path)
     elif kind == "union_tag_not_found":

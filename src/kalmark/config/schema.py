@@ -31,7 +31,7 @@ from kalmark.declare import classes, register, registered_name
 from kalmark.errors import ConfigError
 from kalmark.events import LONGEST_PAUSE_S
 from kalmark.geometry.named_poses import world_of
-from kalmark.logs import FORMATS
+from kalmark.logs import known_formats
 from kalmark.logs.source import Format
 from kalmark.models.protocols import state_columns
 from kalmark.slam.description import STATES, known, sigma_of
@@ -326,7 +326,7 @@ class LogConfig(Section):
         given = {key: value[key] for key in value if key not in cls.model_fields} if isinstance(value, dict) else {}
         if not given:
             return value
-        section = options_of_formats(tuple(FORMATS.values()))
+        section = options_of_formats(tuple(known_formats().values()))
         for key in given:
             if key not in section.model_fields:
                 raise unknown_key(key, "an unknown key", [*cls.model_fields, *section.model_fields])

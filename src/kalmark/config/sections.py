@@ -22,14 +22,15 @@ import kalmark.management.initialization
 import kalmark.management.upkeep
 import kalmark.models.landmarks
 import kalmark.models.motion
-import kalmark.models.sensors
-import kalmark.vision  # noqa: F401 - all of these register their models
+import kalmark.models.sensors  # noqa: F401 - all of these register their models
 from kalmark.declare import (
     Parameter,
     class_of,
     classes,
+    classes_of,
     is_own,
     load_plugin,
+    missing_models,
     parameters,
     plugin_of,
     register_by_file,
@@ -119,7 +120,7 @@ class ModelSection(Section):
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Return how a worker makes it again: the class is made there, of the declarations."""
-        models = classes(self.of_role, self.of_world)[self.of_name]
+        models = classes_of(self.of_role, self.of_name, self.of_world)
         return _unpickled, (self.of_role, self.of_name, self.of_world, plugin_of(models[0])), self.__getstate__()
 
 
@@ -143,9 +144,13 @@ class Choice:
         found = classes(self.role, self.world)
         return [name for name, models in found.items() if self.sensor is None or finds(models[0], self.sensor)]
 
-    def has(self, name: Any) -> bool:
+    def has(self, name: str) -> bool:
         """Return whether there is a type, or a plugin that makes it."""
-        return name in self.names() or (isinstance(name, str) and register_by_file(self.role, name))
+        try:
+            models = classes_of(self.role, name, self.world)
+        except KeyError:
+            return register_by_file(self.role, name)
+        return bool(models) and (self.sensor is None or finds(models[0], self.sensor))
 
     def made(self, name: str, value: Any) -> Section:
         """Return the section of a mapping, if its model takes it."""
@@ -163,14 +168,15 @@ class Choice:
             return value
         if not self.typed:
             return self.made(self.role, value)
-        if not self.names():
-            raise expected("nothing: no detector finds what this sensor measures")
         name: Any = value.get("type", self.default) if isinstance(value, dict) else None
+        if isinstance(name, str) and self.has(name):
+            return self.made(name, value)
+        missing = "".join(f"; {error}" for error in missing_models())
+        if not self.names():
+            raise expected(f"nothing: no detector finds what this sensor measures{missing}")
         if name is None:
             raise PydanticCustomError("union_tag_not_found", "no type", {"types": self.names()})
-        if not self.has(name):
-            raise PydanticCustomError("union_tag_invalid", "unknown type", {"types": self.names()})
-        return self.made(name, value)
+        raise PydanticCustomError("union_tag_invalid", "unknown type", {"types": self.names(), "missing": missing})
 
 
 class OneOf(Choice):
@@ -184,7 +190,7 @@ class OneOf(Choice):
         """Return the types there are."""
         return [*self.sections]
 
-    def has(self, name: Any) -> bool:
+    def has(self, name: str) -> bool:
         """Return whether there is a type."""
         return name in self.names()
 
@@ -206,7 +212,7 @@ def finds(detector: Any, sensor: Any) -> bool:
 
 def section_of(role: str, name: str, world: str = "") -> type[Section]:
     """Return the section of a model; it has `type` where a role has several models."""
-    return _section(role, name, world, tuple(classes(role, world)[name]))
+    return _section(role, name, world, tuple(classes_of(role, name, world)))
 
 
 @cache

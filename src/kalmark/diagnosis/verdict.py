@@ -44,7 +44,7 @@ from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 from kalmark.tracks.surveys import MISFITS
 
-MOST, SHORT = 20_000, 3_000  # observations that a diagnosis takes, and the verdict at the end of a run
+MOST = 20_000  # observations that a diagnosis takes
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, MOST_OFF = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map

@@ -1,7 +1,7 @@
 """Logs of many formats as one stream of events, with the truth to score against."""
 
 from kalmark.logs.download import Dataset, cache_folder, fetch, find_data, list_data
-from kalmark.logs.formats import FORMATS, open_log, stream_log
+from kalmark.logs.formats import FORMATS, known_formats, open_log, stream_log
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.memory_tables import log_from
 from kalmark.logs.native_writer import write_native
@@ -15,6 +15,7 @@ __all__ = [
     "cache_folder",
     "fetch",
     "find_data",
+    "known_formats",
     "list_data",
     "log_from",
     "open_log",

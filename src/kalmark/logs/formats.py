@@ -5,42 +5,38 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from kalmark.errors import LogError, one_line
+from kalmark.errors import LogError, PluginError, one_line
 from kalmark.events import Event, Fix, Scan, order, shown
-from kalmark.logs.bag.importer import BAG
-from kalmark.logs.carmen import CARMEN
 from kalmark.logs.download import find_data
-from kalmark.logs.g2o import G2O
-from kalmark.logs.images.euroc import EUROC
-from kalmark.logs.images.folder import IMAGES, VIDEO
-from kalmark.logs.images.kitti import KITTI_ODOMETRY
-from kalmark.logs.images.tum import TUM_RGBD
 from kalmark.logs.increments import cut
 from kalmark.logs.log import Log
 from kalmark.logs.log_corrections import corrected
-from kalmark.logs.lost_in_the_woods import LOST_IN_THE_WOODS
-from kalmark.logs.mrclam import MRCLAM, MRCLAM_ROBOTS
 from kalmark.logs.native import NATIVE, stream
 from kalmark.logs.overflow import refuse_overflow
-from kalmark.logs.plaza import PLAZA
 from kalmark.logs.poses import KITTI, TUM, read_path
-from kalmark.logs.slamtb import SLAMTB
 from kalmark.logs.source import Format, Request, choice, nearest, quantity, raising
-from kalmark.logs.steps import DLR, FREIBURG
-from kalmark.logs.stereo import KITTI_STEREO, STARRY_NIGHT
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3
-from kalmark.logs.tagslam import TAGSLAM
-from kalmark.logs.victoria_park import VICTORIA_PARK
+from kalmark.plugins import load_all
 
-FORMATS: dict[str, Format] = {entry.name: entry for entry in (
-    NATIVE, MRCLAM, VICTORIA_PARK, LOST_IN_THE_WOODS, DLR, FREIBURG, STARRY_NIGHT, SLAMTB, TAGSLAM, KITTI_STEREO, PLAZA,
-    BAG, G2O, CARMEN, TUM, KITTI, EUROC, TUM_RGBD, KITTI_ODOMETRY, IMAGES, VIDEO,
-)}  # fmt: skip
+FORMATS: dict[str, Format] = {entry.name: entry for entry in (NATIVE, TUM, KITTI)}
+"""The formats of the core, and those that a program of the user's adds; `known_formats` has those of plug-ins, too."""
+
+
+def known_formats() -> dict[str, Format]:
+    """Return all formats of logs, in the order in which they are tried: general ones last."""
+    known = FORMATS | _of_plugins()[0]
+    return dict(sorted(known.items(), key=lambda item: item[1].general))
+
+
+@cache
+def _of_plugins() -> tuple[dict[str, Format], dict[str, PluginError]]:
+    return load_all("formats")
 
 
 def open_log(
@@ -167,22 +163,26 @@ def _dimensions(log: Log, robot: str) -> int:
 
 def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
     """Return the format of the log at `path` and the path its reader takes.  Raises LogError."""
+    known, missing = known_formats(), _of_plugins()[1]
     if format is not None:
-        if format not in FORMATS:
-            raise LogError(f"log format is {format!r}, expected one of {', '.join(FORMATS)}{nearest(format, FORMATS)}")
-        found = FORMATS[format].find(path)
+        if format in missing:
+            raise LogError(f"log format is {format!r}: {missing[format]}")
+        if format not in known:
+            raise LogError(f"log format is {format!r}, expected one of {', '.join(known)}{nearest(format, known)}")
+        found = known[format].find(path)
         if found is None:
-            raise LogError(f"{path}: not a log of format {format}, expected {FORMATS[format].what}")
-        return FORMATS[format], found
-    for entry in FORMATS.values():
+            raise LogError(f"{path}: not a log of format {format}, expected {known[format].what}")
+        return known[format], found
+    for entry in known.values():
         found = entry.find(path)
         if found is not None:
             return entry, found
     below = sorted(child.name for child in path.iterdir() if child.is_dir()) if path.is_dir() else []
-    inside = [name for name in below if any(entry.find(path / name) for entry in FORMATS.values())]
+    inside = [name for name in below if any(entry.find(path / name) for entry in known.values())]
     hint = f"; it holds the logs {', '.join(inside)}" if inside else ""
-    known = "; ".join(f"{entry.name}: {entry.what}" for entry in FORMATS.values())
-    raise LogError(f"{path}: no known log format, expected one of {known}{hint}")
+    kinds = "; ".join(f"{entry.name}: {entry.what}" for entry in known.values())
+    without = f"; of {', '.join(missing)} none can be read: {next(iter(missing.values()))}" if missing else ""
+    raise LogError(f"{path}: no known log format, expected one of {kinds}{hint}{without}")
 
 
 def robot_names(robots: Any, prefix: str = "") -> tuple[str, ...] | None:
@@ -203,7 +203,8 @@ def keep_robots(log: Log, request: Request) -> Log:
         if robot not in log.robots:
             hint = nearest(robot, log.robots)
             raise LogError(f"{log.path or log.name}: no robot {robot!r}, expected one of {', '.join(log.robots)}{hint}")
-    others = set(MRCLAM_ROBOTS if log.format == MRCLAM.name else log.robots) - set(request.robots)
+    entry = known_formats().get(log.format)
+    others = {*log.robots, *(entry.robots if entry else ())} - {*request.robots}
     left_out: Counter[str] = Counter()
     kept = (without(event, others, left_out) for event in log if event.robot in request.robots)
     events = [event for event in kept if event is not None]

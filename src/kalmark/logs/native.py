@@ -39,7 +39,7 @@ from kalmark.declare import classes, is_own
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, in_order, order, shown
 from kalmark.logs.geodesy import Globe, origin_of
-from kalmark.logs.images.image_files import Album
+from kalmark.logs.image_files import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
 from kalmark.logs.table import PARQUET, Content, Refused, Row, read_table

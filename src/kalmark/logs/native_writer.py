@@ -14,7 +14,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan
 from kalmark.files import replace_folder
-from kalmark.logs.images.image_files import write_depth, write_image
+from kalmark.logs.image_files import write_depth, write_image
 from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, RIG
 from kalmark.logs.source import landmark_id, nanoseconds, seconds

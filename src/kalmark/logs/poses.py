@@ -207,5 +207,9 @@ def read(path: Path, request: Request) -> Log:
     return Log(path.stem, (ROBOT,), [], kind, path, truth={ROBOT: read_path(path, request)}, skipped=request.skipped)
 
 
-TUM = Format("tum", "poses as TUM has them, rows t x y z qx qy qz qw", partial(find, cells=TUM_CELLS), read)
-KITTI = Format("kitti", "poses as KITTI has them, rows of 12 numbers", partial(find, cells=KITTI_CELLS), read)
+TUM = Format(
+    "tum", "poses as TUM has them, rows t x y z qx qy qz qw", partial(find, cells=TUM_CELLS), read, general=True
+)
+KITTI = Format(
+    "kitti", "poses as KITTI has them, rows of 12 numbers", partial(find, cells=KITTI_CELLS), read, general=True
+)

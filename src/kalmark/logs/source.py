@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from decimal import Decimal
 from difflib import get_close_matches
 from functools import cached_property
@@ -79,8 +79,9 @@ class Format:
     """Describe one log format: how to tell it (`find` gives the path to read, or None) and how to read it.
 
     `read` takes that path, a `Request`, and the format's own options, each declared as a parameter of a model is: from
-    the annotations follow their checks, keys of configurations and documentation.  With `describes_all` a log says all
-    that a configuration needs.
+    the annotations follow their checks, keys of configurations and documentation.  A `general` one is recognised where
+    no other is.  With `describes_all` a log says all that a configuration needs.  `robots` are those that a log may
+    observe, in it or not; `known_maps` reads files of landmarks known beforehand, by the endings of their names.
     """
 
     name: str
@@ -89,6 +90,9 @@ class Format:
     read: Callable[..., Log]
     robot_prefix: str = ""
     describes_all: bool = False
+    general: bool = False
+    robots: tuple[str, ...] = ()
+    known_maps: Mapping[str, Callable[[Path, bool], list[Any]]] = field(default_factory=dict, hash=False)
 
     @cached_property
     def options(self) -> dict[str, Parameter]:

@@ -11,7 +11,7 @@ from kalmark.declare import plugin_of
 from kalmark.errors import MapError
 from kalmark.events import Scan
 from kalmark.geometry.frames3d import compose
-from kalmark.logs import FORMATS
+from kalmark.logs import known_formats
 from kalmark.logs.log import Log
 from kalmark.models.protocols import calibrating, parameter_names
 from kalmark.models.sensors import TagCorners
@@ -39,7 +39,7 @@ def configuration(slam: Slam, log: Log, known: str | None = None) -> dict[str, A
     own: list[Any] = [type(each) for each in models if not isinstance(each, np.ndarray | np.generic)]
     if log.path is not None:
         said["log"] = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
-        own += [FORMATS[log.format].read] if log.format in FORMATS else []
+        own += [entry.read] if (entry := known_formats().get(log.format)) else []
     plugins = sorted({str(file) for each in own if (file := plugin_of(each)) is not None})
     described = describe(slam)
     described["map"] |= {} if known is None else {"known": known}

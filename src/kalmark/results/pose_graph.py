@@ -1,6 +1,6 @@
 """A run as a graph that g2o reads: poses and landmarks as estimated, edges of the motion and of what was observed.
 
-Conventions of the lines: `kalmark.logs.g2o`.  Landmarks have numbers behind those of the poses; a comment has the
+Conventions of the lines: `kalmark.datasets.g2o`.  Landmarks have numbers behind those of the poses; a comment has the
 id of each.
 """
 

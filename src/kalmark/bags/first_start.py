@@ -1,0 +1,77 @@
+"""The start of a robot in a first configuration, by its fixes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from kalmark.bags.first_words import GUESS
+from kalmark.bags.survey import Poses, Survey, TopicSummary, yaw
+from kalmark.logs.geodesy import local
+
+NEAR_NS = 500_000_000
+LEAST_WAY_M = 2.0
+POSE_M, POSE_RAD = 0.5, 0.2  # sigmas of positions and headings that come without a covariance
+
+
+@dataclass
+class Start:
+    """Where a robot starts: x, y, heading, their two sigmas, and why.
+
+    `north`: the map's axes are east and north; `known`: whether something tells the heading.
+    """
+
+    at: list[float]
+    sigmas: list[float]
+    why: str
+    north: bool = False
+    known: bool = True
+
+
+def start_of(found: Survey, control: Any, used: Mapping[str, tuple[dict[str, Any], str]], space: bool) -> Start | None:
+    """Return a robot's start in the frame of its fixes, None if nothing tells it or true poses in that frame do."""
+    if control is None or space:
+        return None
+    fixes, true = ([found.named(name) for name, (entry, _) in used.items() if entry["type"] == kind]
+                   for kind in ("fix", "truth"))  # fmt: skip
+    of_poses = [topic for topic in true if topic.offers.pose is not None]
+    if not fixes or any(topic.frame == fixes[0].frame or not topic.frame for topic in of_poses):
+        return None
+    fix, poses = fixes[0], control.poses if isinstance(control, TopicSummary) else found.pairs[control]
+    if fix.offers.pose is not None:
+        cov = np.diag([POSE_M**2] * 3 + [POSE_RAD**2] * 3) if fix.poses.cov is None else fix.poses.cov
+        sigmas = [math.sqrt(max(cov[0, 0], cov[1, 1], 1e-4)), math.sqrt(max(cov[5, 5], 1e-4))]
+        first = fix.poses.frames[0]
+        at = [float(first[0]), float(first[1]), yaw(first)]
+        return Start(at, sigmas, f"{GUESS} the first pose of {fix.name}")
+    if (laid := aligned(poses, fix)) is not None:
+        return Start(*laid, f"{GUESS} the way by odometry laid upon that by {fix.name}", north=True)
+    return Start([0.0] * 3, [5.0, 1.5], f"{GUESS} its heading, from east to the left", north=True, known=False)
+
+
+def aligned(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], list[float]] | None:
+    """Return the start (x, y, heading) that lays a way by odometry upon satellite fixes, and its sigmas.
+
+    By least squares; None where they have too little way in common.
+    """
+    if not odometry.moves:
+        return None
+    t_ns, frames = np.array(odometry.t_ns), np.array(odometry.frames)
+    lla = np.array([frame[:3] for frame in fixes.poses.frames])
+    enu = local(lla, fixes.origin)[:, :2]
+    after = np.clip(np.searchsorted(t_ns, fixes.poses.t_ns), 1, len(t_ns) - 1)
+    near = np.abs(t_ns[after] - np.array(fixes.poses.t_ns)) < NEAR_NS
+    p, q = frames[after[near], :2], enu[near]
+    if len(p) < 3 or np.ptp(p, axis=0).max() < LEAST_WAY_M:
+        return None
+    a, b = p - p.mean(axis=0), q - q.mean(axis=0)
+    turn = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
+    R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    spread = math.sqrt(float(np.mean((b - a @ R.T) ** 2))) + 0.05
+    start = R @ (frames[0, :2] - p.mean(axis=0)) + q.mean(axis=0)
+    heading = math.remainder(yaw(frames[0]) + turn, 2 * math.pi)
+    return [float(start[0]), float(start[1]), heading], [spread, max(spread / float(np.linalg.norm(a)), 0.05)]

@@ -1,0 +1,122 @@
+"""Readings of the own robot in a bag, of inertial units and compasses: of its sensors, or controls."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.bags.inertial_messages import GRAVITY, GYRO, HEADING, INCLINATION, heading_of, heading_of_field, means
+from kalmark.bags.messages import Measured, Message
+from kalmark.bags.opening import Received
+from kalmark.bags.topics import Compass, Imu, InertialTopic, Sparse
+from kalmark.errors import LogError
+from kalmark.events import Control, Event, Scan
+from kalmark.geometry import rotations
+from kalmark.logs.source import seconds
+from kalmark.logs.table import Refused
+
+
+@dataclass
+class Gathered:
+    """What has become of messages: events, the columns of sensors (robot, name), and how many were left out and why."""
+
+    events: list[Event] = field(default_factory=list)
+    sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+    left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
+
+    def is_next(self, received: Received, before_ns: int | None, t_ns: int, what: str) -> bool:
+        """Return whether a time follows the one before; one that is the same is counted.  Raises Refused."""
+        if before_ns is None or t_ns > before_ns:
+            return True
+        if t_ns < before_ns:
+            raise Refused(f"time after {seconds(before_ns)} s, expected times that never run backwards")
+        self.left_out[received.topic, f"{what} at the time of the one before"] += 1
+        return False
+
+
+class OwnReadings:
+    """Takes the readings of a robot's own sensors.
+
+    `level` is that of `Mounts`.
+    """
+
+    def __init__(self, out: Gathered, level: Mapping[str, tuple[Array, bool]], in_space: Callable[[str], bool]) -> None:
+        self.out, self.level, self.in_space = out, level, in_space
+        self.rates: dict[tuple[str, str], dict[int, Array]] = {}
+        self.read_ns: dict[tuple[str, str], int] = {}
+
+    def take(self, received: Received, topic: Sparse, offer: Message, t_ns: int) -> None:
+        """Take what an inertial unit or a compass measured of its robot, of what is sparse only now and then."""
+        for sensor, columns, y in self.said(received, topic, offer):
+            key, often = (topic.robot, sensor), columns in GYRO.values()
+            if often and isinstance(topic, Imu) and topic.at == "controls":
+                self.rates.setdefault(key, {})[t_ns] = y
+            elif often or key not in self.read_ns or t_ns - self.read_ns[key] >= topic.every_s * 1e9:
+                self.reading(received, *key, t_ns, columns, y)
+
+    def said(self, received: Received, topic: Sparse, offer: Any) -> Iterator[tuple[str, tuple[str, ...], Any]]:
+        """Yield what a message says, in the plane made level: the sensor, its columns and their numbers."""
+        m, R = received.message, self.level.get(received.topic, (np.eye(3), False))[0]
+        if isinstance(topic, Compass) and (b := self.measured(received, "field", offer.field(m))) is not None:
+            heading = heading_of_field(R @ b)
+            if heading is None:
+                self.out.left_out[received.topic, "fields that are steep"] += 1
+            else:
+                yield topic.sensors(received.topic)[0], HEADING, [heading]
+        if not isinstance(topic, Imu):
+            return
+        if topic.gyro and (w := self.measured(received, "rates", offer.rates(m))) is not None:
+            space = self.in_space(topic.robot)
+            yield topic.gyro, GYRO[space], w if space else (R @ w)[2:]
+        q = self.measured(received, "an orientation", offer.attitude(m)) if topic.heading or topic.inclination else None
+        if topic.heading and q is not None:
+            yield topic.heading, HEADING, [heading_of(q, R)]
+        if topic.inclination and q is not None:
+            yield topic.inclination, INCLINATION, rotations.to_euler(np.ascontiguousarray(q))[0][:2]
+        if topic.gravity and (a := self.measured(received, "accelerations", offer.force(m))) is not None:
+            yield topic.gravity, GRAVITY, a
+
+    def measured(self, received: Received, what: str, told: Measured | None) -> Array | None:
+        """Return what a message measured; None, and counted, if it did not."""
+        if told is None:
+            self.out.left_out[received.topic, f"messages without {what}"] += 1
+            return None
+        if not np.isfinite(told.v).all():
+            raise Refused(f"{what} {told.v.tolist()}, expected finite numbers")
+        return told.v
+
+    def reading(self, received: Received, robot: str, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any) -> None:
+        """Take a reading of a sensor of the robot itself: one at a time."""
+        if self.read_ns.get((robot, sensor)) == t_ns:
+            self.out.left_out[received.topic, f"readings of {sensor} at the time of the one before"] += 1
+            return
+        self.read_ns[robot, sensor] = t_ns
+        self.out.sensor_columns.setdefault((robot, sensor), columns)
+        self.out.events.append(Scan(t_ns=t_ns, robot=robot, sensor=sensor, y=[[*map(float, y)]]))
+
+    def averaged(self, where: Any) -> None:
+        """Add the means of rates from one control of the robot to the next.  Raises LogError if it has none."""
+        for (robot, sensor), rates in self.rates.items():
+            ends = sorted({e.t_ns for e in self.out.events if isinstance(e, Control) and e.robot == robot})
+            if not ends:
+                wanted = "controls of this robot, or `at: messages`"
+                raise LogError(f"{where}: {sensor} of {robot!r} has `at: controls`, expected {wanted}")
+            t_ns = np.array(sorted(rates))
+            found = means(t_ns, np.array([rates[t] for t in t_ns.tolist()]), ends)
+            self.out.sensor_columns[robot, sensor] = GYRO[self.in_space(robot)]
+            self.out.events += [Scan(t_ns=t, robot=robot, sensor=sensor, y=w[None]) for t, w in found]
+
+    def inertial(self, received: Received, topic: InertialTopic, offer: Message, t_ns: int) -> None:
+        """Take rates and specific forces, held from now on; times must increase."""
+        w = self.measured(received, "rates", offer.rates(received.message))  # type: ignore[misc]
+        a = self.measured(received, "accelerations", offer.force(received.message))  # type: ignore[misc]
+        if w is None or a is None:
+            return
+        if self.out.is_next(received, self.read_ns.get((topic.robot, "")), t_ns, "readings"):
+            self.read_ns[topic.robot, ""] = t_ns
+            self.out.events.append(Control(t_ns=t_ns, robot=topic.robot, u=np.concatenate([w, a])))

@@ -1,0 +1,199 @@
+"""The layout of EuRoC (Burri and others, 2016), ASL's: `mav0` with cameras, an inertial unit and the true states.
+
+The robot is the inertial unit; `T_BS` of a camera's sensor.yaml is its mount.  The readings from the first image to the
+last drive the robot, with the noise of the data sheet or, where the unit shakes, of the readings.  It starts in its
+true state at the first image where the log has that, else at rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.datasets.images.rigs import MOTION, ROBOT, camera, camera_log
+from kalmark.errors import LogError
+from kalmark.events import Control, Frame, shown
+from kalmark.files import unpacked
+from kalmark.geometry.named_poses import describe_pose
+from kalmark.logs.camera_calibration import read_calibration
+from kalmark.logs.image_files import frames_of
+from kalmark.logs.log import Log, Times, Trajectory, interpolate
+from kalmark.logs.source import Format, Request, nearest, number, read_text
+from kalmark.logs.table_columns import INERTIAL, TWIST3
+from kalmark.models.motion import shaken
+
+TRUE_STATES = "state_groundtruth_estimate0/data.csv"
+ADIS16448 = {  # the data sheet in EuRoC's imu0/sensor.yaml
+    "gyroscope_noise_density_rad_per_sqrt_s": 1.6968e-4,
+    "gyroscope_random_walk_radps_per_sqrt_s": 1.9393e-5,
+    "accelerometer_noise_density_mps_per_sqrt_s": 2.0e-3,
+    "accelerometer_random_walk_mps2_per_sqrt_s": 3.0e-3,
+}
+NAMES = dict(zip(("gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density",
+                  "accelerometer_random_walk"), ADIS16448, strict=True))  # fmt: skip
+DENSITIES = tuple(ADIS16448)[::2]  # not the walks
+SURE = {
+    "sigma_rotation_deg": [1.0, 1.0, 0.0],
+    "sigma_v_mps": 0.05,
+    "sigma_bias_w_radps": 0.01,
+    "sigma_bias_a_mps2": 0.1,
+}
+AT_REST = {"at_rest": True, "sigma_bias_w_radps": 0.1, "sigma_bias_a_mps2": 0.1}
+BIASES = tuple(f"bias_{name}" for name in INERTIAL)
+
+
+def find(path: Path) -> Path | None:
+    """Return the folder `mav0`, given it or the one around it."""
+    return next((f for f in (path, path / "mav0") if (f / "cam0" / "data.csv").is_file()), None)
+
+
+def read(
+    path: Path,
+    request: Request,
+    cameras: Annotated[tuple[str, ...], "The cameras, by the names of their folders."] = ("cam0",),
+    imu: Annotated[Literal["auto", "none"], "Let the inertial unit move the robot, if there is one."] = "auto",
+) -> Log:
+    """Return the log of these cameras.  Raises LogError."""
+    there = sorted(folder.name for folder in path.glob("cam*") if (folder / "data.csv").is_file())
+    for name in cameras:
+        if name not in there:
+            raise LogError(f"{path}: no camera {shown(name)}, expected {', '.join(there)}{nearest(str(name), there)}")
+    frames: list[Frame] = []
+    sections: dict[str, Any] = {}
+    for name in cameras:
+        listed = image_list(path / name)
+        taken = frames_of(ROBOT, name, [*listed], [*listed.values()], request)
+        calibration = read_calibration(path / name / "sensor.yaml")
+        frames, sections[name] = [*frames, *taken], camera(taken, calibration)
+    begin, end = (pick(frame.t_ns for frame in frames) for pick in (min, max))
+    states = true_states(path)
+    truth = {} if states is None else {ROBOT: Trajectory(states.t_ns, states.rows[:, :7])}
+    readings = csv_of(path / "imu0" / "data.csv", 7) if imu == "auto" else None
+    name = (path.resolve().parent if path.name == "mav0" else path).name
+    if readings is None:
+        return camera_log("euroc", path, request, frames, sections, MOTION, name=name, truth=truth)
+    start = None if states is None else started(states, begin)
+    half_ns = int(np.median(np.diff(readings.t_ns))) // 2 if len(readings.t_ns) > 1 else 0
+    since = readings.t_ns - half_ns  # a reading is of the interval around its time
+    first = int(np.searchsorted(since, begin, "right")) - 1 if start is not None else 0
+    if first < 0:
+        raise LogError(f"{path / 'imu0'}: the readings begin after the first image, expected some before it")
+    kept = slice(first, int(np.searchsorted(since, end, "right")))
+    times, u = since[kept], readings.rows[kept]
+    held = np.maximum(times, begin) if start is not None else times  # the first one, from the start on
+    controls = [Control(t_ns=t, robot=ROBOT, u=one) for t, one in zip(held.tolist(), u, strict=True)]
+    motion: dict[str, Any] = {"type": "inertial"} | data_sheet(path / "imu0" / "sensor.yaml")
+    for key, density in zip(DENSITIES, shaken(np.asarray(times * 1e-9), u), strict=True):
+        motion[key] = max(motion[key], density)
+    return camera_log("euroc", path, request, [*frames, *controls], sections, motion, INERTIAL, name=name, truth=truth,
+                      start=AT_REST if start is None else start)  # fmt: skip
+
+
+class Table(NamedTuple):
+    """Rows (N, m) at times (N,) ns."""
+
+    t_ns: Times
+    rows: Array
+
+
+def lines_of(file: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield (line, cells) of a CSV file, packed or not, without its comments.  Raises LogError."""
+    packed = file.with_name(f"{file.name}.gz")
+    try:
+        text = b"".join(unpacked(packed, LogError)).decode() if packed.is_file() else read_text(file)
+    except UnicodeDecodeError as error:
+        raise LogError(f"{packed}: {error}, expected UTF-8") from None
+    for line, content in enumerate(text.splitlines(), 1):
+        if content.strip() and not content.lstrip().startswith("#"):
+            yield line, [cell.strip() for cell in content.split(",")]
+
+
+def csv_of(file: Path, columns: int) -> Table | None:
+    """Return a table of EuRoC, ns and numbers, without rows that run back in time; None if there is no such file.
+
+    Raises LogError.
+    """
+    if not file.is_file() and not file.with_name(f"{file.name}.gz").is_file():
+        return None
+    t_ns: list[int] = []
+    numbers: list[list[float]] = []
+    for line, cells in lines_of(file):
+        try:
+            t, row = int(cells[0]), [number(cell) for cell in cells[1:]]
+            good = len(cells) == columns and not (t_ns and t <= t_ns[-1])
+        except ValueError:
+            good = False
+        if not good:
+            wanted = f"{columns} cells: increasing times in ns, and finite numbers"
+            raise LogError(f"{file}:{line}: {shown(','.join(cells))}, expected {wanted}")
+        t_ns.append(t)
+        numbers.append(row)
+    if not t_ns:
+        raise LogError(f"{file}:1: no rows of data, expected times in ns and numbers")
+    return Table(np.array(t_ns, dtype=np.int64), np.array(numbers))
+
+
+def image_list(folder: Path) -> dict[int, Path]:
+    """Return the images of a camera by their times (ns).  Raises LogError."""
+    found: dict[int, Path] = {}
+    for line, cells in lines_of(folder / "data.csv"):
+        if len(cells) != 2 or not cells[0].isdecimal() or (found and int(cells[0]) <= max(found)):
+            where = f"{folder / 'data.csv'}:{line}"
+            raise LogError(f"{where}: {shown(','.join(cells))}, expected increasing times in ns, each with a file")
+        found[int(cells[0])] = folder / "data" / cells[1]
+    if not found:
+        raise LogError(f"{folder / 'data.csv'}:1: no rows of data, expected times and files")
+    return found
+
+
+def true_states(path: Path) -> Table | None:
+    """Return the true states: x y z, qx qy qz qw, velocity, biases of rate and force (16,); None without a file.
+
+    They are those of the layout, or of the only file `gt*.csv` beside `mav0`.  Raises LogError.
+    """
+    others = sorted(path.resolve().parent.glob("gt*.csv"))
+    file = path / TRUE_STATES
+    if not file.is_file():
+        if len(others) != 1:
+            return None
+        file = others[0]
+    table = csv_of(file, 17)
+    assert table is not None
+    order = [0, 1, 2, 4, 5, 6, 3, *range(7, 16)]  # EuRoC's quaternions begin with w
+    states = table.rows[:, order]
+    states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
+    return Table(table.t_ns, states)
+
+
+def started(states: Table, t_ns: int) -> dict[str, Any] | None:
+    """Return the true state at a time (ns) as the section of a start, None if that is outside the true states."""
+    after = int(np.searchsorted(states.t_ns, t_ns))
+    if t_ns < states.t_ns[0] or after == len(states.t_ns):
+        return None
+    before = max(after - 1, 0)
+    span = max(int(states.t_ns[after] - states.t_ns[before]), 1)
+    share = (t_ns - int(states.t_ns[before])) / span if after > before else 0.0
+    a, b = states.rows[before], states.rows[after]
+    pose = interpolate(a[None, :7], b[None, :7], np.array([share]))[0]
+    rest = a[7:] + share * (b[7:] - a[7:])
+    return describe_pose(pose) | dict(zip((*TWIST3[:3], *BIASES), map(float, rest), strict=True)) | SURE
+
+
+def data_sheet(file: Path) -> dict[str, float]:
+    """Return the noise of the inertial unit: of its sensor.yaml, without one that of EuRoC's.  Raises LogError."""
+    from kalmark.logs.source import mapping
+
+    if not file.is_file():
+        return dict(ADIS16448)
+    content = mapping(file)
+    try:
+        return {own: float(content[name]) for name, own in NAMES.items()}
+    except (KeyError, TypeError, ValueError) as error:
+        raise LogError(f"{file}: {error}, expected numbers for {', '.join(NAMES)}") from None
+
+
+EUROC = Format("euroc", "a folder mav0 with cam0/data.csv of EuRoC", find, read, describes_all=True)

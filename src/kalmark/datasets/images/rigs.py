@@ -1,0 +1,70 @@
+"""The description of a log of images: a camera that moves in space, and the search in its images."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from kalmark.errors import LogError
+from kalmark.events import Event, Frame
+from kalmark.logs.camera_calibration import read_calibration
+from kalmark.logs.image_files import size_of
+from kalmark.logs.log import Log
+from kalmark.logs.source import Request, one_robot
+
+ROBOT, CAMERA = "robot", "camera"
+MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 1.0, "sigma_w_radps_per_sqrt_s": 2.0}
+"""Of a camera that is moved by hand."""
+START = {"sigma_v_mps": 0.3, "sigma_w_radps": 0.5}
+SEARCH = {
+    "detector": {"type": "active_search"},
+    "landmark": {"type": "homogeneous", "prior_rho_per_m": 0.5, "sigma_rho_per_m": 0.5},
+}
+"""How landmarks are found; of one camera alone the depths with which they begin are the unit of length."""
+CALIBRATIONS = ("calibration.yaml", "camera.yaml", "camera_info.yaml", "calibration.yml", "camera.yml", "config.yml")
+
+
+def camera(frames: Sequence[Frame], known: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the section of a pin-hole camera: what is known of it, for images of the size of these.
+
+    A calibration for images of another size is scaled: the centre of the first pixel is 0.
+    """
+    size, found = size_of(frames), dict(known or {})
+    for axis, name in (("x", "width_px"), ("y", "height_px")):
+        scale = size[name] / found.get(name, size[name])
+        if scale != 1.0:
+            found[f"f{axis}_px"] *= scale
+            found[f"c{axis}_px"] = (found[f"c{axis}_px"] + 0.5) * scale - 0.5
+    return {"type": "pinhole"} | found | size | SEARCH
+
+
+def calibration_beside(folder: Path) -> dict[str, Any]:
+    """Return the calibration in a folder, by the file names that programs give it, {} if there is none.
+
+    Raises LogError if it cannot be read.
+    """
+    file = next((folder / name for name in CALIBRATIONS if (folder / name).is_file()), None)
+    if file is None:
+        return {}
+    found = read_calibration(file)
+    found.pop("mount", None)  # on a body that this log does not have
+    return found
+
+
+def camera_log(
+    format: str, path: Path, request: Request, events: Iterable[Event], sensors: Mapping[str, Any],
+    motion: Mapping[str, Any] = MOTION, controls: tuple[str, ...] = (), **rest: Any,
+) -> Log:  # fmt: skip
+    """Return the log of a robot with cameras, `sensors` by name, whose frames are among the events."""
+    start = rest.pop("start", START)
+    robot = {"motion": dict(motion), "start": dict(start), "sensors": dict(sensors)}
+    rig: dict[str, Any] = {"robots": {ROBOT: robot}, "map": {"type": "dense"}}  # most landmarks are in view
+    if motion is MOTION:
+        rig["estimator"] = {"type": "ekf"}  # one linearisation: docs/vision.md
+    return one_robot(format, path, request, ROBOT, events, controls, {}, describes=rig, **rest)
+
+
+def no_times(path: Path, what: str) -> LogError:
+    """Return the error of images without times."""
+    return LogError(f"{path}: {what}, expected times: names that are times, times.txt beside them, or log.fps (Hz)")

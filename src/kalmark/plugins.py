@@ -1,0 +1,54 @@
+"""Plug-ins: what installed packages, kalmark's own parts among them, add to the core through entry points.
+
+| group | entry |
+|---|---|
+| `kalmark.formats` | a `kalmark.logs.source.Format` of logs, under its name |
+| `kalmark.models` | a module that registers models (`kalmark.register`) |
+| `kalmark.verbs` | a function of the command line |
+| `kalmark.writers` | what `kalmark convert` writes, under the ending of its file: `(path, log, run) -> {part: count}` |
+| `kalmark.names` | a name of the package `kalmark` |
+
+Nothing is imported before it is asked for, and one that cannot be loaded stops no other.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from kalmark.errors import PluginError
+
+
+@cache
+def _installed() -> Any:
+    return entry_points()  # of all groups at once: it reads a file of each package
+
+
+@cache
+def found(group: str) -> dict[str, EntryPoint]:
+    """Return the entry points of `kalmark.GROUP` by name, none of them loaded."""
+    return {entry.name: entry for entry in _installed().select(group=f"kalmark.{group}")}
+
+
+def load(group: str, name: str) -> Any:
+    """Return what an entry point names.  Raises PluginError if no package has it, or if it cannot be loaded."""
+    if name not in found(group):
+        raise PluginError(f"no installed package has {name!r} among its kalmark.{group}, expected one")
+    entry = found(group)[name]
+    try:
+        return entry.load()
+    except Exception as error:
+        raise PluginError(f"{name!r} of {entry.value} cannot be loaded: {error}") from None
+
+
+def load_all(group: str) -> tuple[dict[str, Any], dict[str, PluginError]]:
+    """Return what the entry points of a group name, and the errors of those that cannot be loaded, both by name."""
+    loaded: dict[str, Any] = {}
+    failed: dict[str, PluginError] = {}
+    for name in found(group):
+        try:
+            loaded[name] = load(group, name)
+        except PluginError as error:
+            failed[name] = error
+    return loaded, failed

@@ -1,0 +1,173 @@
+"""Plug-ins: a package of a user's adds a format, models and a verb; the core works without kalmark's own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+OWN = '''
+from pathlib import Path
+from typing import Annotated
+
+import kalmark as km
+from kalmark.declare import Positive
+from kalmark.logs.source import Format, Request, one_robot
+
+
+@km.register("motion", "tram")
+class Tram(km.motion.Unicycle):
+    """Motion of a tram."""
+
+
+def find(path: Path) -> Path | None:
+    return path if path.suffix == ".tram" else None
+
+
+def read(path: Path, request: Request, step_s: Annotated[Positive, "Time of a step."] = 1.0) -> km.Log:
+    speeds = map(float, path.read_text().split())
+    events = [km.Control(t_s=k * step_s, robot="tram", u=(v, 0.0)) for k, v in enumerate(speeds)]
+    return one_robot("tram", path, request, "tram", events, ("v_mps", "w_radps"), {})
+
+
+TRAM = Format("tram", "a file that ends in .tram", find, read)
+
+
+def last_stop(log: Path) -> None:
+    """Print the time of the last event of a log."""
+    print(km.open_log(log).events[-1].t_ns)
+'''
+POINTS = """[kalmark.formats]
+tram = trams:TRAM
+broken = trams:NOTHING
+
+[kalmark.models]
+trams = trams
+
+[kalmark.verbs]
+last-stop = trams:last_stop
+
+[kalmark.names]
+Tram = trams:Tram
+"""
+OUTSIDE = ("kalmark.bags", "kalmark.datasets", "kalmark.diagnosis", "kalmark.vision")
+WITHOUT = f"""
+import sys
+
+class NotThere:
+    def find_spec(self, name, path=None, target=None):
+        if name in {OUTSIDE}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}")
+
+sys.meta_path.insert(0, NotThere())
+"""
+CORE = """
+import kalmark as km
+from kalmark.cli import main
+
+assert main(["simulate", "cloister", "--out", "log", "--seed", "1", "--set", "steps=40"]) == 0
+assert main(["run", "log/config.yaml", "--out", "run"]) == 0
+assert main(["convert", "log", "copy"]) == 0
+slam = km.Slam.load("run/map.kmk")
+assert len(slam.landmarks()) > 5
+assert len(km.open_log("copy").events) == len(km.open_log("log").events)
+"""
+
+
+def python(code: str, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, cwd=folder, check=False
+    )
+
+
+@pytest.fixture
+def trams(tmp_path: Path) -> Path:
+    """Return a folder with an installed package, as pip leaves one."""
+    (tmp_path / "trams.py").write_text(OWN)
+    (tmp_path / "trams-1.dist-info").mkdir()
+    (tmp_path / "trams-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: trams\nVersion: 1\n")
+    (tmp_path / "trams-1.dist-info" / "entry_points.txt").write_text(POINTS)
+    (tmp_path / "day.tram").write_text("1.0 2.0 1.5")
+    return tmp_path
+
+
+def test_a_package_adds_a_format_with_its_options_a_model_a_verb_and_a_name(trams: Path) -> None:
+    (trams / "day.yaml").write_text("log: {path: day.tram, step_s: 2}\nrobots: {each: {motion: {type: tram}}}\n")
+    code = """
+import kalmark as km
+from kalmark.cli import main
+from kalmark.config import build_slam, open_run
+
+config, log = open_run("day.yaml")
+robot = build_slam(config, log).robots["tram"]
+print(log.format, log.events[-1].t_ns, type(robot.motion) is km.Tram)
+main(["last-stop", "day.tram"])
+for options in ({"step_s": -1}, {"steps": 1}):
+    try:
+        km.open_log("day.tram", **options)
+    except km.KalmarkError as error:
+        print(error)
+try:
+    km.open_log("day.tram", "broken")
+except km.KalmarkError as error:
+    print(error)
+"""
+    done = python(code, trams)
+    assert done.stdout.splitlines() == [
+        "tram 4000000000 True",
+        "2000000000",
+        "log option step_s is -1, expected a positive number",
+        "log option 'steps' is unknown to tram, expected step_s; did you mean 'step_s'?",
+        "log format is 'broken': 'broken' of trams:NOTHING cannot be loaded: module 'trams' has no attribute 'NOTHING'",
+    ], done.stderr
+
+
+def test_the_core_simulates_runs_saves_and_reloads_without_the_plug_ins(tmp_path: Path) -> None:
+    done = python(WITHOUT + CORE, tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["landmarks"] > 5
+    assert "verdict" not in summary
+    warned = [line for line in done.stderr.splitlines() if "no verdict" in line]
+    assert len(warned) == 1
+    assert "'diagnose' of kalmark.diagnosis.verdict:diagnose cannot be loaded" in warned[0]
+
+
+def test_what_needs_a_part_that_is_missing_names_it_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text(
+        "robots: {r: {motion: {type: odometry_3d}, sensors: {eye: {type: pinhole, detector: {type: active_search}}}}}\n"
+    )
+    code = """
+import sys
+from pathlib import Path
+import kalmark as km
+from kalmark.cli import main
+from kalmark.config import load_config
+
+Path("log").mkdir()
+Path("log/controls.csv").write_text("t_s,robot,v_mps,w_radps\\n0,r,1,0\\n")
+for call in (
+    lambda: km.open_log(".", "mrclam"),
+    lambda: km.open_log("camera.yaml"),
+    lambda: load_config("camera.yaml"),
+    lambda: km.diagnose,
+):
+    try:
+        call()
+    except (km.KalmarkError, AttributeError) as error:
+        print(error)
+main(["convert", "log", "log.mcap"])
+main(["tune", "camera.yaml"])
+"""
+    done = python(WITHOUT + code, tmp_path)
+    mrclam, unknown, detector, name = done.stdout.splitlines()
+    assert mrclam.startswith("log format is 'mrclam': 'mrclam' of kalmark.datasets.mrclam:MRCLAM cannot be loaded: ")
+    assert unknown.endswith("'bag' of kalmark.bags.importer:BAG cannot be loaded: No module named 'kalmark.bags'")
+    assert "robots.r.sensors.eye.detector: got {'type': 'active_search'}, expected" in detector
+    assert "'vision' of kalmark.vision cannot be loaded" in detector
+    assert name.startswith("'diagnose' of kalmark.diagnosis.verdict:diagnose cannot be loaded")
+    assert "kalmark: 'mcap' of kalmark.bags.run_messages:export cannot be loaded" in done.stderr
+    assert "kalmark: the verb 'tune' of kalmark.diagnosis.tune_verb:tune cannot be loaded" in done.stderr
