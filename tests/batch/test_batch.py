@@ -317,7 +317,7 @@ def test_another_log_than_that_of_the_run_is_refused() -> None:
     with pytest.raises(KalmarkError, match="expected the log of the run"):
         solve_batch(run, list(log)[:-10])
     nameless = replace(run, source=None)
-    with pytest.raises(KalmarkError, match="which log it was made from"):
+    with pytest.raises(KalmarkError, match="does not name the log it was made from"):
         batch_entry(nameless)
 
 

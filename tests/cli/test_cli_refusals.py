@@ -160,7 +160,7 @@ def test_a_misspelt_robot_in_one_line_is_refused_or_left_out(
         (["run", "native", "--log", "nowhere"], "log 'nowhere' not found, expected it at"),
         (
             ["run", "native", "--log", "log", "--set", "log.r_max=1"],
-            "log.r_max: got 1.0, which logs of format native do",
+            "log.r_max: got 1, which logs of format native do",
         ),
         (
             ["run", "native", "--log", "log", "--set", "log.format=nativ"],
@@ -168,7 +168,7 @@ def test_a_misspelt_robot_in_one_line_is_refused_or_left_out(
         ),
         (
             ["run", "native", "--log", "log", "--set", "robots.each.motion.sigma_v_mps=-1"],
-            "got -1, expected a number >=",
+            "got -1, expected a number of at least 0",
         ),
         (["run", "native", "--log", "log", "--set", "robots.each.start.sigma_xy_m=.nan"], "got nan, expected a finite"),
         (

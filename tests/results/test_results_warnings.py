@@ -130,7 +130,7 @@ def test_a_first_fix_far_from_the_start_says_which_setting_to_change() -> None:
     lines = warned(log, fixed(log, (11.0, 2.0)))
     (line,) = (line for line in lines if "first fix" in line)
     assert "of rover is 11." in line
-    assert "known to 0 m: set robots.rover.start" in line
+    assert "with a configured sigma of 0 m: set robots.rover.start" in line
 
 
 def test_noise_that_is_not_the_log_s_is_noticed() -> None:

@@ -106,7 +106,7 @@ class Format:
                 wanted = f"{', '.join(self.options) or 'none'}{nearest(name, self.options)}"
                 raise LogError(f"log option {name!r} is unknown to {self.name}, expected {wanted}")
             option = self.options[name]
-            if wanted := option.refused(value):
+            if value is not option.default and (wanted := option.refused(value)):
                 raise LogError(
                     f"log option {name} is {shown(value)}, expected {wanted}{nearest(str(value), option.words)}"
                 )

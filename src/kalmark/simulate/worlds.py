@@ -30,6 +30,7 @@ from kalmark.config.tree import Tree, merged, read_tree
 from kalmark.simulate.layouts import Layout, TexturedPlanes, TexturedRoom
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import SimulatedSensing
+from kalmark.slam.description import plain
 
 Count = Annotated[int, Field(ge=1)]
 IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types of sensors whose images can be rendered
@@ -165,7 +166,7 @@ class World(OfFile):
         """Return the text of a file that describes this world, every default written out; `load_world` reads it."""
         yaml, out = YAML(), io.StringIO()
         yaml.default_flow_style = False
-        yaml.dump(self.model_dump(mode="json", exclude_none=True), out)
+        yaml.dump(plain(self.model_dump(exclude_none=True)), out)
         return out.getvalue()
 
     def _laid_over(self, values: dict[str, Any]) -> Tree:
