@@ -159,7 +159,7 @@ def test_every_page_program_and_test_that_prose_names_exists() -> None:
 
 
 def test_every_module_and_name_that_prose_puts_into_backticks_exists() -> None:
-    package, sources = ROOT / "src" / "kalmark", [path.read_text() for path in SOURCES]
+    package, sources = ROOT / "src" / "kalmark", [path.read_text() for path in (*SOURCES, ROOT / "pyproject.toml")]
     for path in PROSE:
         text = path.read_text()
         for name, told in re.findall(r"`(?:src/kalmark/)?((?:[a-z_]+/)+[a-z_0-9]+\.py)(?:: ([\w., ]+))?`", text):
