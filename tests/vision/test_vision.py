@@ -16,7 +16,7 @@ from kalmark.tracks.joint_expectation import Prospect
 from kalmark.vision.appearance import predicted, taken
 from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.pairs import with_pairs
-from kalmark.vision.planes import Rectangle as Surroundings
+from kalmark.vision.planes import Plane as Surroundings
 from kalmark.vision.selection import Search
 from kalmark.vision.template_matching import Searcher, correlation
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.datasets.array_files import arrays, events_of, find_variables, refuse_shapes, times
-from kalmark.declare import NotNegative
+from kalmark.declare import Number
 from kalmark.errors import LogError
 from kalmark.files import read_arrays
 from kalmark.geometry.named_poses import describe_pose
@@ -98,7 +98,7 @@ def find_kitti(path: Path) -> Path | None:
 def read_kitti(
     path: Path,
     request: Request,
-    min_disparity_px: Annotated[NotNegative, "Drop observations with a smaller disparity."] = 1.0,
+    min_disparity_px: Annotated[Number, "Drop observations with a smaller disparity; negative: none."] = 1.0,
     rates: Annotated[Literal["mean", "held"], "Hold the mean of two rates between them, or the first."] = "mean",
 ) -> Log:
     """Return the log; observations with a disparity below `min_disparity_px` are left out and counted.
