@@ -369,6 +369,7 @@ TABLES: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]
         lambda d, _: d["tracks"]["confirmed"].append([50, d["tracks"]["confirmed"][0][1] | {"id": 50, "slot": -1}]),
         "slot of 50 is -1",
     ),
+    "a negative count": (lambda d, _: d["tracks"]["confirmed"][0][1].update(hits=-1), r"2 has the counts .*-1"),
     "candidates of a sensor that is not there": (
         lambda d, _: d["tracks"]["candidates"].append([["a", "nose"], []]),
         "that there are not",

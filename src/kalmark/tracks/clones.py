@@ -9,7 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from kalmark.arrays import Array
+from kalmark.errors import MapError
 
 User = tuple[str, str]  # a channel: robot, sensor
 
@@ -29,6 +32,12 @@ class Measurement:
     y: Array
     R: Array
     own_noise: bool
+
+    def restored(self) -> None:
+        """Check the arrays of a file.  Raises MapError."""
+        square = self.y.ndim == 1 and self.R.ndim == 2 and self.R.shape[0] == self.R.shape[1]
+        if not square or not np.isfinite(self.y).all() or not np.isfinite(self.R).all():
+            raise MapError(f"a measurement of {self.robot!r}, {self.sensor!r} is {self.y} with the noise {self.R}")
 
     @property
     def late(self) -> tuple[int, str, str, int]:

@@ -83,7 +83,8 @@ class Looks:
 
     def restored(self) -> None:
         """Check the arrays of a file.  Raises MapError."""
-        if self.counts.shape != (2, CELLS) or self.table.shape != (CELLS,):
+        shapes = (self.counts.shape, self.table.shape) == ((2, CELLS), (CELLS,))
+        if not shapes or not (self.counts >= 0).all() or not (self.table >= 0).all():
             raise MapError(f"the counts of looks are {self.counts.shape} and {self.table.shape}, expected {(2, CELLS)}")
 
 

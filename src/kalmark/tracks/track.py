@@ -57,6 +57,14 @@ class Pending:
     evidence: float = 0.0
     t_ns: int = 0
 
+    def restored(self) -> None:
+        """Check the arrays of a file.  Raises MapError."""
+        arrays = [array for array in (self.mean, self.cov, self.poses) if array is not None]
+        if (self.poses is not None and self.poses.shape != (2, 7)) or not all(np.isfinite(a).all() for a in arrays):
+            raise MapError(f"the pending arrays of {self.name!r} are {arrays}, expected finite numbers, and two poses")
+        if len(self.log_weights) != len(self.hypotheses):
+            raise MapError(f"{self.name!r} has {len(self.log_weights)} weights of {len(self.hypotheses)} hypotheses")
+
 
 @dataclass
 class Track:
@@ -96,6 +104,12 @@ class Track:
     pending: Pending | None = None
     measurements: list[Measurement] = field(default_factory=list)
     of: Id | None = None
+
+    def restored(self) -> None:
+        """Check the counts and the extent of a file.  Raises MapError."""
+        counts = (self.observations, self.searched, self.found, self.hits, self.chances, self.seen)
+        if min(counts) < 0 or (self.extent is not None and self.extent.shape != (2,)):
+            raise MapError(f"{self.id!r} has the counts {counts} and the extent {self.extent}")
 
 
 def _looks_invented(name: Id) -> bool:
