@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lowest lint bench bench-peers bench-growth fuzz clean
+.PHONY: demo test lowest lint docs bench bench-peers bench-growth fuzz clean
 
 demo: $(VENV)/base.stamp
 	$(BIN)/kalmark demo
@@ -21,6 +21,10 @@ lint: $(VENV)/test.stamp
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python benchmarks/structure.py --check
+
+# the site in build/site, from docs/ and the docstrings; no network but for the packages
+docs: $(VENV)/docs.stamp
+	$(BIN)/python -m sphinx -W --keep-going -q -d build/doctrees docs build/site
 
 bench: $(VENV)/bench.stamp
 	$(BIN)/python benchmarks/step.py
@@ -47,6 +51,10 @@ $(VENV)/test.stamp: $(VENV)/base.stamp
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	touch $@
 
+$(VENV)/docs.stamp: $(VENV)/base.stamp
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	touch $@
+
 $(VENV)/bench.stamp: $(VENV)/base.stamp
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[peers]'
 	touch $@
@@ -62,4 +70,4 @@ $(VENV)-lowest/stamp: pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-lowest out
+	rm -rf $(VENV) $(VENV)-lowest out build docs/lessons docs/project

@@ -6,12 +6,14 @@ import inspect
 import json
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import figures
+import matplotlib.pyplot as plt
 import pytest
 
 from kalmark.cli.app import app
@@ -20,6 +22,7 @@ from kalmark.logs import known_formats
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+LESSONS = sorted((ROOT / "docs" / "course").rglob("plot_*.py"))
 BLOCKS = [
     (page, number, block)
     for page in PAGES
@@ -43,6 +46,16 @@ def test_a_page_s_code_runs(page: Path, number: int, block: str, tmp_path: Path)
 @pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
 def test_an_example_runs(example: Path, tmp_path: Path) -> None:
     assert run([str(example)], tmp_path)
+
+
+@pytest.mark.parametrize("lesson", LESSONS, ids=lambda p: p.stem)
+def test_a_lesson_runs_and_is_short(lesson: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = lesson.read_text()
+    code = [line for line in text.split('"""', 2)[2].splitlines() if line.strip() and not line.startswith("#")]
+    assert len(code) <= 30 and max(map(len, code)) <= 96
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(lesson))
+    plt.close("all")
 
 
 def test_pages_call_kalmark_and_python_as_the_readme_says_once_the_environment_is_active() -> None:

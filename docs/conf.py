@@ -1,0 +1,80 @@
+"""The documentation site, built by `make docs`: Sphinx, MyST, the pydata theme and sphinx-gallery, all offline."""
+
+import os
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS / "site"))
+os.environ["MPLBACKEND"] = "Agg"
+
+import kalmark  # noqa: E402
+import kalmark.compiled  # noqa: E402
+
+kalmark.compiled.COMPILING = ""  # no page shows the note of the compiler
+
+project, author, release = "kalmark", "the authors of kalmark", kalmark.__version__
+copyright = "the authors of kalmark, MIT licence"
+extensions = [
+    "myst_parser",
+    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # MathJax's own files: no page needs a network
+    "sphinx_gallery.gen_gallery",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "project_pages",
+]
+exclude_patterns = ["course", "site", "**/*.ipynb"]
+root_doc = "index"
+language = "en"
+nitpicky = True
+
+# Markdown as a code host shows it
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 4
+myst_dmath_double_inline = True
+mathjax_path = "mathjax/tex-chtml.js"
+mathjax3_config = {"options": {"enableMenu": False}}
+
+# A page of the course is a program: course/CHAPTER/plot_NAME.py
+sphinx_gallery_conf = {
+    "examples_dirs": ["course"],
+    "gallery_dirs": ["lessons"],
+    "filename_pattern": r"plot_",
+    "within_subsection_order": "FileNameSortKey",
+    "subsection_order": ["course/guide", "course/exercises", "course/slides", "course/toolbox"],
+    "download_all_examples": False,
+    "remove_config_comments": True,
+    "show_memory": False,
+    "show_signature": False,
+    "min_reported_time": 1e9,
+    "write_computation_times": False,
+    "plot_gallery": "True",
+    "image_srcset": ["2x"],
+    "capture_repr": ("_repr_html_", "__repr__"),
+    "copyfile_regex": r".*\.csv",
+    "default_thumb_file": str(DOCS / "images" / "cloister.png"),
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "kalmark"
+html_static_path = ["site/static"]
+html_css_files = ["kalmark.css"]
+html_show_sourcelink = False
+html_copy_source = False
+html_sidebars = {"index": []}
+html_theme_options = {
+    "logo": {"text": "kalmark"},
+    "navbar_align": "left",
+    "navbar_end": ["theme-switcher"],
+    "show_toc_level": 2,
+    "show_nav_level": 2,
+    "navigation_with_keys": False,
+    "show_prev_next": True,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "pygments_light_style": "a11y-high-contrast-light",
+    "pygments_dark_style": "a11y-high-contrast-dark",
+}
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True

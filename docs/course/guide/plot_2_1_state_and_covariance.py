@@ -1,0 +1,65 @@
+r"""
+[S] 2: the state and its covariance
+===================================
+
+The map is one Gaussian of the robot and all landmarks, [S] (5) and (6):
+
+.. math::
+
+   x = \begin{bmatrix} \mathcal{R} \\ \mathcal{M} \end{bmatrix}, \qquad
+   P = \begin{bmatrix} P_{RR} & P_{RM} \\ P_{MR} & P_{MM} \end{bmatrix}
+
+A control changes the robot's rows and columns only, [S] (9) and (10). An observation of one landmark changes all of
+:math:`P`, [S] (22) and (23).
+"""
+
+# %%
+# One robot, three landmarks
+# --------------------------
+#
+# ``TextbookSlam`` is the filter as the guide prints it. The robot sees three landmarks; each is added to the map.
+import matplotlib.pyplot as plt
+import numpy as np
+
+from kalmark.filter.textbook import TextbookSlam
+
+Q, R = np.diag([0.2, 0.1]) ** 2, np.diag([0.1, 0.02]) ** 2
+slam = TextbookSlam(start=[0, 0, 0], P=np.diag([0.1, 0.1, 0.05]) ** 2, Q=Q, R=R)
+for y in ([3.0, 0.6], [4.0, -0.3], [2.5, -1.0]):
+    slam.initialize(y)
+before = slam.P.copy()
+
+# %%
+# One control, one observation
+# ----------------------------
+#
+# The robot drives 1 m and turns by 0.3 rad. Then it sees the first landmark 5 cm farther away than expected.
+slam.predict([1.0, 0.3])
+moved = slam.P.copy()
+e, _ = slam.expect(0)
+slam.correct(0, e + np.array([0.05, 0.0]))
+corrected = slam.P.copy()
+
+# %%
+# P as a picture
+# --------------
+#
+# The square root of each element's size; dark is zero. The landmarks are correlated, since one uncertain pose saw them
+# all. The control changes only the first three rows and columns; the observation of one landmark makes the variances of
+# the robot and of all landmarks smaller.
+figure, axes = plt.subplots(1, 3, figsize=(10, 3.6), layout="constrained", sharey=True)
+labels = ["x", "y", "θ", "l₁", "", "l₂", "", "l₃", ""]
+titles = ["before", "after the control", "after l₁ is seen"]
+for ax, P, title in zip(axes, (before, moved, corrected), titles, strict=True):
+    ax.imshow(np.sqrt(np.abs(P)), cmap="viridis", vmin=0, vmax=np.sqrt(moved.max()))
+    ax.set_title(title)
+    ax.set_xticks(range(9), labels)
+    ax.set_yticks(range(9), labels)
+    print(f"{title}: sigmas of the robot {np.sqrt(np.diag(P)[:3]).round(3)}")
+
+# %%
+# Try changing
+# ------------
+#
+# * The noise of the turn: ``Q = np.diag([0.2, 0.3]) ** 2``. Which rows of P grow?
+# * The landmark that is seen: ``slam.correct(2, ...)``. Which of the others gain most?

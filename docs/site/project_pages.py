@@ -1,0 +1,30 @@
+"""CONTRIBUTING.md and CHANGELOG.md as pages of the site, in project/, their links as seen from there."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+FILES = {"CONTRIBUTING.md": "project/contributing.md", "CHANGELOG.md": "project/changelog.md"}
+
+
+def write(app: Any) -> None:
+    """Write the pages where git ignores them."""
+    docs = Path(app.srcdir)
+    for name, page in FILES.items():
+        text = re.sub(r"\]\((?!https?:|#)(?:docs/)?", "](../", (docs.parent / name).read_text())
+        (docs / page).parent.mkdir(exist_ok=True)
+        if not (docs / page).exists() or (docs / page).read_text() != text:
+            (docs / page).write_text(text)
+
+
+def link(app: Any, name: str, source: list[str]) -> None:
+    """Point the pages to these instead of the files above them."""
+    for file, page in FILES.items():
+        source[0] = source[0].replace(f"](../{file}", f"]({page}")
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Connect both."""
+    app.connect("builder-inited", write)
+    app.connect("source-read", link)
+    return {"parallel_read_safe": True}
