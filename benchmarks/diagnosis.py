@@ -18,7 +18,7 @@ import numpy as np
 
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.diagnosis.verdict import diagnose
-from kalmark.events import Control, Fix, Scan, order
+from kalmark.events import Control, Fix, Scan, sort_key
 from kalmark.geometry import observe
 from kalmark.geometry.frames import compose, inverse
 from kalmark.logs.log import Log
@@ -69,7 +69,7 @@ def controlled(change: Callable[[np.ndarray], np.ndarray]) -> Plant:
 def late(log: Log, rng: np.random.Generator) -> Log:
     """Stamp the scans .1 s late."""
     moved = [seen(e, t_ns=e.t_ns + 100_000_000) if isinstance(e, Scan) else e for e in log.events]
-    return replace(log, events=sorted(moved, key=order))
+    return replace(log, events=sorted(moved, key=sort_key))
 
 
 def moving(log: Log, rng: np.random.Generator) -> Log:
@@ -195,7 +195,7 @@ def fixed(log: Log, rng: np.random.Generator) -> Log:
         Fix(t_ns=int(t), robot="rover", y=pose[:2] + rng.normal(size=2) * 0.3, cov=0.09 * np.eye(2))
         for t, pose in [*zip(truth.t_ns, truth.poses, strict=True)][::10]
     ]
-    return replace(log, events=sorted([*log.events, *fixes], key=order))
+    return replace(log, events=sorted([*log.events, *fixes], key=sort_key))
 
 
 def stopped(log: Log, rng: np.random.Generator) -> Log:

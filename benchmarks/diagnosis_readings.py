@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from kalmark.config import build_slam
 from kalmark.config.building import config_dict
-from kalmark.diagnosis.mistakes import measured
+from kalmark.diagnosis.mistakes import change_measurements
 from kalmark.diagnosis.state_readings import ARM, CONSTANT, NAMES, SCALE, SIGMA, SIGN
 from kalmark.diagnosis.verdict import MISFIT, diagnose
 from kalmark.results.record import record
@@ -82,7 +82,7 @@ def causes(world: str, sensor: str, fault: Fault, seed: int, more: list[str]) ->
     made = load_world(world, [*more, *keys])
     log = simulate(made, seed)
     if fault.by:
-        change = measured({(robot, sensor)}, lambda y: y * fault.by)
+        change = change_measurements({(robot, sensor)}, lambda y: y * fault.by)
         log = replace(log, events=[change(event) for event in log])
     log = log.without_truth()
     config = made.config()

@@ -20,7 +20,7 @@ import numpy as np
 from diagnosis import kidnapped, none, seen
 from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import LEAST, MOST_OFF, SIGMAS, diagnose
-from kalmark.events import Control, Fix, Scan, order
+from kalmark.events import Control, Fix, Scan, sort_key
 from kalmark.logs.log import Log
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.record import record
@@ -75,7 +75,7 @@ def late(by_s: float, robot: str = "", sensor: str = "") -> Plant:
             mine = isinstance(e, Scan) and robot in (e.robot, "") and sensor in (e.sensor, "")
             return seen(e, t_ns=e.t_ns + round(by_s * 1e9)) if mine else e
 
-        return replace(log, events=sorted(map(of, log.events), key=order))
+        return replace(log, events=sorted(map(of, log.events), key=sort_key))
 
     return plant
 
@@ -106,7 +106,7 @@ def fixed(log: Log, rng: np.random.Generator) -> Log:
         for name, truth in log.truth.items()
         for t, pose in [*zip(truth.t_ns, truth.poses, strict=True)][10::10]
     ]
-    return replace(log, events=sorted([*log.events, *fixes], key=order))
+    return replace(log, events=sorted([*log.events, *fixes], key=sort_key))
 
 
 def times(*by: float) -> Change:

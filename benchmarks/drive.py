@@ -86,7 +86,7 @@ def started(read: np.ndarray, heading: float, estimator: str, receiver_m: float,
     cov = np.zeros((15, 15))
     cov[:3, :3], cov[5, 5] = START_M**2 * np.eye(3), heading**2
     cov[9:, 9:] = np.diag(np.repeat([SIGMA_W, SIGMA_F], 3) ** 2)
-    rest = km.motion.at_rest(UNIT, DT_S * np.arange(len(read)), read, np.eye(16)[6], cov)
+    rest = km.motion.start_at_rest(UNIT, DT_S * np.arange(len(read)), read, np.eye(16)[6], cov)
     of_arm = np.diag([ARM_M**2] * 3 + [0.0] * 3)
     sensors = {
         "gps": km.Mount(km.sensors.Gps3D(sigma_m=receiver_m), at=(0.5, 0, 1, 0, 0, 0, 1), cov=of_arm),

@@ -3,7 +3,7 @@
     KALMARK_DATA=... python benchmarks/filter_vs_batch.py [NAME ...] [--estimator invariant ekf]
 
 One line a log and filter: raw position RMSE and pose NEES (mean over the robots, where there is a truth), the figures
-of `kalmark.results.batch.compare`, and the processor times of the filter and of the batch solution.
+of `kalmark.results.batch.compare_with_filter`, and the processor times of the filter and of the batch solution.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import argparse
 import time
 
 from kalmark.config import build_slam, load_config, open_config_log
-from kalmark.results.batch import compare, solve_batch
+from kalmark.results.batch import compare_with_filter, solve_batch
 from kalmark.results.record import record
 
 CASES = {
@@ -43,7 +43,9 @@ def row(name: str, estimator: str) -> str:
     solved = time.process_time()
     robots = run.evaluate()["robots"].values()
     known = {c: [f[c] for f in robots if f.get(c) is not None] for c in ROBOT}
-    figures = {c: sum(values) / len(values) if values else None for c, values in known.items()} | compare(run, batch)
+    figures = {c: sum(values) / len(values) if values else None for c, values in known.items()} | compare_with_filter(
+        run, batch
+    )
     cells = " ".join(f"{figures[c]:>20.4g}" if figures[c] is not None else f"{'-':>20}" for c in COLUMNS)
     return f"{name:<22} {estimator:<10} {cells} {filtered - start:>8.1f} {solved - filtered:>8.1f}"
 

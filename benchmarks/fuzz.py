@@ -284,7 +284,7 @@ def a_bag(ros1: bool) -> bytes:
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
 
-    from kalmark.bags.mcap_writer import Types, header
+    from kalmark.bags.mcap_writer import Types, header_fields
 
     types_ = Types(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE))
     encode = types_.store.serialize_ros1 if ros1 else types_.store.serialize_cdr
@@ -295,7 +295,7 @@ def a_bag(ros1: bool) -> bytes:
                 connection = writer.add_connection(topic, kind, typestore=types_.store)
                 for k in range(3):
                     turn = {"orientation": {"w": 1.0}, "position": {"x": float(k)}}
-                    fields = {"header": header(k * 10**9 + 1, "base_link"), "pose": {"pose": turn}} | turn
+                    fields = {"header": header_fields(k * 10**9 + 1, "base_link"), "pose": {"pose": turn}} | turn
                     writer.write(connection, k * 10**9 + 1, encode(types_.made(kind, fields), kind))
         return (path if ros1 else next(path.glob("*.db3"))).read_bytes()
 

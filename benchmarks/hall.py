@@ -108,7 +108,7 @@ def hall(seed: int, gap_s: float = 0.0, bad_wheel: bool = True, held: bool = Fal
             events.append(km.Scan(t_ns=then, robot="rover", sensor="laser", y=y))
     times = np.round(np.arange(len(poses)) * DT_S * 1e9).astype(np.int64)
     return Log(
-        "hall", ("rover",), sorted(events, key=km.events.order), truth={"rover": Trajectory(times, poses)},
+        "hall", ("rover",), sorted(events, key=km.events.sort_key), truth={"rover": Trajectory(times, poses)},
         landmarks=dict(enumerate(places)), control_columns={"rover": MOTIONS[held].columns},
         sensor_columns={("rover", "laser"): km.sensors.RangeBearing.columns},
     )  # fmt: skip

@@ -225,7 +225,7 @@ class Recorded(Run):
         sigmas = np.repeat([TRUTH_M, 0.0, 0.0, 0.1, 0.1], 3)
         sigmas[5] = math.radians(0.5)
         start = np.concatenate([self.flight.states[0, :7], np.zeros(9)])
-        rest = km.motion.at_rest(unit, at[:-1] - self.lead_ns * 1e-9, self.u, start, np.diag(sigmas**2))
+        rest = km.motion.start_at_rest(unit, at[:-1] - self.lead_ns * 1e-9, self.u, start, np.diag(sigmas**2))
         until_ns = round(rest.until_s * 1e9)
         mount = km.Mount(self.sensor, at=self.at)
         robot = km.Robot("unit", unit, rest.start, {"camera": mount}, cov=rest.cov, rests_until_ns=until_ns)

@@ -32,7 +32,7 @@ from kalmark.campaign.campaign import Anees, figures
 from kalmark.campaign.scoring import Scores, score
 from kalmark.config.building import build_slam
 from kalmark.geometry.spaces import mount_space
-from kalmark.models.protocols import calibrating, parameter_covariance
+from kalmark.models.protocols import parameter_covariance, self_calibrating
 from kalmark.simulate import load_world
 from kalmark.simulate.robots import simulation
 from kalmark.slam.held_control import bias_name
@@ -73,7 +73,7 @@ def run(name: str, seed: SeedSequence, estimator: str, noise: float) -> Scored:
     scores = score(slam, simulated, world.times(), map_every=world.steps)
     (robot,) = slam.robots.values()
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # error, covariance and prior of each block
-    if (model := calibrating(robot.motion)) is not None:
+    if (model := self_calibrating(robot.motion)) is not None:
         block = bias_name(robot.name)
         found.append(
             (slam.mean(block) - simulated.constants[robot.name], slam.covariance(block), model.calibration_cov)

@@ -26,7 +26,7 @@ import kalmark as km
 from kalmark.config import build_slam, open_run
 from kalmark.datasets.victoria_park import ANTENNA, ROBOT
 from kalmark.diagnosis.verdict import diagnose
-from kalmark.events import Event, order
+from kalmark.events import Event, sort_key
 from kalmark.filter.kernels import one_thread
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log
@@ -46,7 +46,7 @@ SIGMA_START_M, SIGMA_START_RAD = 5.0, 0.3
 def readings(log: Log, sensor: str, columns: tuple[str, ...], extra: Iterable[Event]) -> Log:
     """Return a log with the readings of another sensor of its one robot."""
     of = {**log.sensor_columns, (log.robots[0], sensor): columns}
-    return replace(log, events=sorted([*log.events, *extra], key=order), sensor_columns=of)
+    return replace(log, events=sorted([*log.events, *extra], key=sort_key), sensor_columns=of)
 
 
 def woods() -> None:

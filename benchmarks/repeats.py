@@ -20,7 +20,7 @@ from hall import hall, mapped, right
 
 import kalmark as km
 from kalmark.arrays import Array
-from kalmark.management.repeated_places import repeats
+from kalmark.management.repeated_places import find_repeats
 
 REACH_M, SIGMA_M = 8.0, 0.03
 World = Callable[[np.random.Generator], Array]
@@ -104,7 +104,7 @@ def worlds(runs: int) -> int:
             rng, slam = np.random.default_rng(seed), empty()
             part(slam, world(rng), rng)
             begin = time.perf_counter()
-            found += bool(repeats(slam.map, slam.tracks))
+            found += bool(find_repeats(slam.map, slam.tracks))
             lasts.append(time.perf_counter() - begin)
         total += found
         size = len(slam.landmarks())

@@ -22,7 +22,7 @@ from scipy.optimize import linear_sum_assignment
 import kalmark as km
 from kalmark import config as cfg
 from kalmark.cli.run import run_log
-from kalmark.results.association_errors import known_as
+from kalmark.results.association_errors import names_in_log
 from kalmark.results.evaluate import known_landmarks
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.record import record
@@ -48,7 +48,7 @@ def misplaced(known: Run, hidden: Run) -> int:
     """Return how many of the wrong pairs are of landmarks farther apart than `BESIDE_M` in the map with ids."""
     landmarks, history = known_landmarks(known), hidden.history
     at = dict(zip(map(str, landmarks.ids), landmarks.positions()[0], strict=True))
-    names, count = known_as(history), 0
+    names, count = names_in_log(history), 0
     mine = history.fused & (history.id == "")
     for landmark, true in zip(history.landmark[mine].tolist(), history.true_id[mine].tolist(), strict=True):
         taken = names.get(landmark, true)

@@ -29,10 +29,10 @@ import cv2
 import numpy as np
 
 from kalmark.config import open_run
-from kalmark.config.schema import pose_of
 from kalmark.config.sections import model_of
 from kalmark.events import Frame
 from kalmark.geometry.frames3d import compose
+from kalmark.geometry.named_poses import pose_of
 
 CORNERS, SPACING_PX, LEAST = 300, 10, 12  # points that are tracked, the distance between them, inliers of a pose
 MOVED_PX, ANGLE_RAD, REPROJECTED_PX = 20.0, np.radians(2.0), 2.0

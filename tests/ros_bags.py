@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.bags.mcap_writer import Outgoing, Types, header
+from kalmark.bags.mcap_writer import Outgoing, Types, header_fields
 from kalmark.events import Control, Event, Scan
 from kalmark.logs import Log, open_log
 from kalmark.logs.geodesy import earth_centred
@@ -94,7 +94,7 @@ def pose(x: float, y: float, theta: float, z: float = 0.0) -> dict[str, Any]:
 def transform(parent: str, child: str, t_ns: int, at: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a geometry_msgs/TransformStamped."""
     moved = {"translation": at["position"], "rotation": at["orientation"]}
-    return {"header": header(t_ns, parent), "child_frame_id": child, "transform": moved}
+    return {"header": header_fields(t_ns, parent), "child_frame_id": child, "transform": moved}
 
 
 def tf(topic: str, t_ns: int, *transforms: dict[str, Any]) -> Outgoing:
@@ -103,7 +103,7 @@ def tf(topic: str, t_ns: int, *transforms: dict[str, Any]) -> Outgoing:
 
 def odometry(t_ns: int, at: dict[str, Any], v: float = 0.0, w: float = 0.0, topic: str = "/odom") -> Outgoing:
     twist = {"linear": {"x": v, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": w}}
-    fields = {"header": header(t_ns, "odom"), "child_frame_id": "base_link"}
+    fields = {"header": header_fields(t_ns, "odom"), "child_frame_id": "base_link"}
     fields |= {"pose": {"pose": at, "covariance": np.zeros(36)}}
     fields |= {"twist": {"twist": twist, "covariance": np.diag([0.01, 1, 1, 1, 1, 0.02]).ravel()}}
     return Outgoing(topic, "nav_msgs/msg/Odometry", t_ns, fields)
@@ -150,7 +150,7 @@ def imu(
     t_ns: int, w: Any, q: Any = (0.0, 0.0, 0.0, 1.0), spread: float = 0.0, a: Any = (0.0, 0.0, 9.8), topic: str = "/imu"
 ) -> Outgoing:
     """Return an Imu: rates (3,), orientation (4,) with the variance `spread`, unknown at 0 and absent at -1."""
-    fields: dict[str, Any] = {"header": header(t_ns, "imu")}
+    fields: dict[str, Any] = {"header": header_fields(t_ns, "imu")}
     fields["angular_velocity"] = dict(zip("xyz", map(float, w), strict=True))
     fields["angular_velocity_covariance"] = np.diag([1e-4, 1e-4, 1e-4]).ravel()
     fields["orientation"] = dict(zip("xyzw", map(float, q), strict=True))
@@ -161,7 +161,7 @@ def imu(
 
 def field(t_ns: int, b: Any) -> Outgoing:
     """Return a MagneticField (3,)."""
-    fields = {"header": header(t_ns, "imu"), "magnetic_field": dict(zip("xyz", map(float, b), strict=True))}
+    fields = {"header": header_fields(t_ns, "imu"), "magnetic_field": dict(zip("xyz", map(float, b), strict=True))}
     return Outgoing("/mag", "sensor_msgs/msg/MagneticField", t_ns, fields)
 
 
@@ -197,7 +197,9 @@ def _robot_among_posts(seed: int) -> list[Outgoing]:
         out.append(odometry(t, pose(*here), 1.0, 0.15))
         out.append(tf("/tf", t, transform("odom", "base_link", t, pose(*here))))
         out.append(
-            Outgoing("/truth", "geometry_msgs/msg/PoseStamped", t, {"header": header(t, "map"), "pose": pose(*true)})
+            Outgoing(
+                "/truth", "geometry_msgs/msg/PoseStamped", t, {"header": header_fields(t, "map"), "pose": pose(*true)}
+            )
         )
         if k % 2 == 0:
             out.append(laser_scan(t, true, angles, random))
@@ -214,13 +216,13 @@ def laser_scan(t_ns: int, true: np.ndarray, angles: np.ndarray, random: np.rando
     world = LaserWorld(np.column_stack([local, np.full(len(POSTS), RADIUS), np.zeros(len(POSTS))]))
     r, _ = world.scan(angles, 0.01, random)
     r[r > 30] = np.inf
-    fields = {"header": header(t_ns, "laser"), "angle_min": angles[0], "angle_max": angles[-1]}
+    fields = {"header": header_fields(t_ns, "laser"), "angle_min": angles[0], "angle_max": angles[-1]}
     fields |= {"angle_increment": angles[1] - angles[0], "range_min": 0.05, "range_max": 30.0, "ranges": r}
     return Outgoing("/scan", "sensor_msgs/msg/LaserScan", t_ns, fields)
 
 
 def fix(t_ns: int, lla: list[float], status: int = 0, kind: int = 2, sigma: float = 0.5) -> Outgoing:
-    fields: dict[str, Any] = {"header": header(t_ns, "gps"), "status": {"status": status}}
+    fields: dict[str, Any] = {"header": header_fields(t_ns, "gps"), "status": {"status": status}}
     fields |= dict(zip(("latitude", "longitude", "altitude"), lla, strict=True))
     fields |= {"position_covariance": np.diag([sigma**2, sigma**2, 1.0]).ravel(), "position_covariance_type": kind}
     return Outgoing("/fix", "sensor_msgs/msg/NavSatFix", t_ns, fields)

@@ -64,7 +64,7 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
             waited.append(True)
 
     def begin() -> None:
-        compiled.ahead(positive_sum, compile_correction, "textbook", "none", 1, False)
+        compiled.compile_on_second_core(positive_sum, compile_correction, "textbook", "none", 1, False)
 
     monkeypatch.setattr(compiled.subprocess, "Popen", Started)
     monkeypatch.setattr(compiled, "cache_folder", lambda part: str(tmp_path))
@@ -73,8 +73,8 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
     begin()  # while it is under way
     ((text, mark),) = asked
     for _ in range(2):
-        compiled.caught_up(count)
-        compiled.caught_up(positive_sum)
+        compiled.wait_for_compilation(count)
+        compiled.wait_for_compilation(positive_sum)
     assert waited == [True]
     compiled.work_ahead(text, mark)
     begin()

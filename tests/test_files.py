@@ -19,13 +19,13 @@ from ruamel.yaml import YAML
 from kalmark import files
 from kalmark.errors import RunError
 from kalmark.files import (
-    locked,
+    hold_lock,
     read_arrays,
     refuse_aliases,
     refuse_bomb,
     replace_file,
     replace_folder,
-    unpacked,
+    unpack_file,
     write,
 )
 
@@ -172,7 +172,7 @@ def test_of_two_writers_a_reader_finds_one_result_whole(tmp_path: Path) -> None:
         writer.start()
     reads = 0
     while any(writer.is_alive() for writer in writers) or not reads:
-        with locked(out, shared=True) as got:
+        with hold_lock(out, shared=True) as got:
             found = content(out)
         assert got
         assert len(found) == 6
@@ -186,12 +186,12 @@ def test_of_two_writers_a_reader_finds_one_result_whole(tmp_path: Path) -> None:
 
 def test_a_lock_that_another_has_is_waited_for_only_so_long(tmp_path: Path) -> None:
     pytest.importorskip("fcntl")
-    with locked(tmp_path / "a.lock") as first, locked(tmp_path / "a.lock", wait_s=0.0) as second:
+    with hold_lock(tmp_path / "a.lock") as first, hold_lock(tmp_path / "a.lock", wait_s=0.0) as second:
         assert first
         assert not second
-    with locked(tmp_path / "a.lock", wait_s=0.0) as again:
+    with hold_lock(tmp_path / "a.lock", wait_s=0.0) as again:
         assert again
-    with locked(tmp_path / "nowhere" / "a.lock") as without:
+    with hold_lock(tmp_path / "nowhere" / "a.lock") as without:
         assert not without
 
 
@@ -212,16 +212,16 @@ def test_a_compressed_file_is_read_to_its_limit_and_no_further(
     monkeypatch.setattr(files, "PIECE", 1000)
     path, content = tmp_path / f"a.{ending}", bytes(10_000)
     path.write_bytes(compress(content))
-    assert b"".join(unpacked(path, RunError)) == content
+    assert b"".join(unpack_file(path, RunError)) == content
     path.write_bytes(compress(bytes(1_000_000)))
     read = 0
     with pytest.raises(RunError, match=rf"a\.{ending}: unpacks to more than \d+ bytes, expected at most that"):
-        for piece in unpacked(path, RunError):
+        for piece in unpack_file(path, RunError):
             read += len(piece)
-    assert read <= files.most_unpacked(path) < 1_000_000
+    assert read <= files.unpacked_limit(path) < 1_000_000
     path.write_bytes(compress(content)[:-8])
     with pytest.raises(RunError, match=r"cannot be unpacked .*, expected a complete file"):
-        list(unpacked(path, RunError))
+        list(unpack_file(path, RunError))
 
 
 def test_arrays_come_back_and_no_longer_than_their_file_is(tmp_path: Path) -> None:

@@ -272,7 +272,7 @@ def linearity(name: str) -> Callable[[Case, Case], list[Pair]]:
 
 
 def normalised(i: Case, o: Case) -> list[Pair]:
-    return [(rotations.normalised(i["v"]), o["vn"])]
+    return [(rotations.normalize(i["v"]), o["vn"])]
 
 
 def point_innovation(i: Case, o: Case) -> list[Pair]:

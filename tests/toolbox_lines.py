@@ -43,7 +43,7 @@ def of_frames(o: Case, name: str, i: Case) -> list[Array]:
 def image_line(i: Case, o: Case) -> list[Pair]:
     """Compare the line through two pixels, homogeneous and not normalised."""
     ends = np.insert(i["s"].reshape(2, 2), 2, 1.0, axis=1)
-    h, H_a, H_b = lines.crossed(ends[:1], ends[1:])
+    h, H_a, H_b = lines.cross_products(ends[:1], ends[1:])
     return [(h[0], o["hm"]), (np.hstack([H_a[0][:, :2], H_b[0][:, :2]]), o["HM_s"])]
 
 

@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from kalmark.errors import KalmarkError, PluginError
-from kalmark.plugins import found, load
+from kalmark.plugins import entry_points_of, load
 
 if TYPE_CHECKING:
     from kalmark import association, detect, geometry, vision
@@ -83,7 +83,7 @@ def __getattr__(name: str) -> Any:
 
 def _of_plugin(name: str) -> Any:
     """Return what a plug-in adds under a name.  Raises AttributeError."""
-    if name not in found("names"):
+    if name not in entry_points_of("names"):
         raise AttributeError(f"module 'kalmark' has no attribute {name!r}")
     try:
         globals()[name] = load("names", name)

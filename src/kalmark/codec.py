@@ -52,11 +52,13 @@ class Reader:
         """Return an array by where its numbers begin and its shape.  Raises MapError."""
         begin, *shape = says
         if any(type(size) is not int or size < 0 for size in says) or begin + math.prod(shape) > len(self.numbers):
-            raise MapError(f"{place(self)} is {says!r}, expected a place in {len(self.numbers)} numbers and a shape")
+            raise MapError(
+                f"{place_in_record(self)} is {says!r}, expected a place in {len(self.numbers)} numbers and a shape"
+            )
         return self.numbers[begin : begin + math.prod(shape)].reshape(shape).astype(dtype)
 
 
-def place(of: Reader | Writer) -> str:
+def place_in_record(of: Reader | Writer) -> str:
     """Return in words where in a record it is."""
     return ".".join(map(str, of.at))
 
@@ -121,7 +123,7 @@ class _Scalar(Kind):
 
     def _checked(self, of: Reader | Writer, value: Any) -> Any:
         if type(value) not in self.types or (self.words and value not in self.words):
-            raise MapError(f"{place(of)} is {value!r}, expected {self.expected}")
+            raise MapError(f"{place_in_record(of)} is {value!r}, expected {self.expected}")
         return value
 
 
@@ -225,7 +227,7 @@ class _Mapping(Kind):
             found[key] = self.of.read(reader, pair[1], (now or {}).get(key))
             reader.at.pop()
         if len(found) != len(says):
-            raise MapError(f"{place(reader)} has {len(says) - len(found)} of its keys twice")
+            raise MapError(f"{place_in_record(reader)} has {len(says) - len(found)} of its keys twice")
         return found
 
 

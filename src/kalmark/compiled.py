@@ -43,7 +43,7 @@ from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
 
-from kalmark.files import locked
+from kalmark.files import hold_lock
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -130,7 +130,7 @@ def compiled(function: F) -> F:
     return made
 
 
-def in_python(function: F) -> F:
+def python_form(function: F) -> F:
     """Return the Python form of a compiled function."""
     python: F = function if numba.config.DISABLE_JIT else function.py_func  # type: ignore[attr-defined]
     return python
@@ -178,7 +178,7 @@ class _OpenedLater(FunctionCache):  # type: ignore[misc, unused-ignore]
             lock = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
             with suppress(OSError):
                 lock.parent.mkdir(parents=True, exist_ok=True)
-            self._lock.enter_context(locked(lock, wait_s=LONGEST_WAIT_S))
+            self._lock.enter_context(hold_lock(lock, wait_s=LONGEST_WAIT_S))
             found = super().load_overload(sig, target_context)
             if found is not None:
                 self._lock.close()
@@ -213,7 +213,7 @@ def address_of(function: Any, signature: Signature) -> int:
     if numba.config.DISABLE_JIT:
         _FUNCTIONS[id(function)] = function
         return id(function)
-    caught_up(function)
+    wait_for_compilation(function)
     function.compile(signature.args)
     result = function.overloads[signature.args]
     if result.signature.return_type != signature.return_type:
@@ -232,10 +232,10 @@ def say_compiling() -> None:
 _AHEAD: dict[Any, subprocess.Popen[bytes]] = {}  # by the function that is waited for
 
 
-def ahead(function: Any, job: Callable[..., None], *arguments: str | int) -> None:
+def compile_on_second_core(function: Any, job: Callable[..., None], *arguments: str | int) -> None:
     """Call job(*arguments), which compiles `function` and more, on a second core, unless that was done before.
 
-    Who needs one of them calls `caught_up(function)` first, and then finds them on the disk.
+    Who needs one of them calls `wait_for_compilation(function)` first, and then finds them on the disk.
     """
     text = json.dumps([job.__module__, job.__name__, *arguments])
     version = f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {sys.version} {text}"
@@ -258,13 +258,13 @@ def ahead(function: Any, job: Callable[..., None], *arguments: str | int) -> Non
 
 
 def work_ahead(text: str, mark: str) -> None:
-    """Do the job of a call of `ahead`; the file `mark` shows that it is done."""
+    """Do the job of a call of `compile_on_second_core`; the file `mark` shows that it is done."""
     module, name, *arguments = json.loads(text)
     getattr(import_module(module), name)(*arguments)
     Path(mark).touch()
 
 
-def caught_up(function: Any) -> None:
+def wait_for_compilation(function: Any) -> None:
     """Wait until a function is on the disk that is compiled on the second core."""
     if _AHEAD and (process := _AHEAD.pop(function, None)) is not None:
         say_compiling()

@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 import numpy as np
 
 from kalmark.errors import KalmarkError, ModelError, PluginError
-from kalmark.events import bound, most, shown
+from kalmark.events import bound, largest_magnitude, short_text
 from kalmark.geometry.spaces import Space
 from kalmark.plugins import load_all
 
@@ -152,7 +152,11 @@ class Parameter:
             except OverflowError:
                 number = -math.inf if operator.lt(value, 0) else math.inf
             if self.within.holds(number):
-                return f"a number of {bound(self.name)}" if most(self.name)[0] < abs(number) < math.inf else ""
+                return (
+                    f"a number of {bound(self.name)}"
+                    if largest_magnitude(self.name)[0] < abs(number) < math.inf
+                    else ""
+                )
             return self.wanted if math.isfinite(number) or self.within.infinite else "a finite number"
         if get_origin(self.type) is tuple:
             kind, *more = get_args(self.type)
@@ -221,7 +225,7 @@ def _parameter(name: str, default: Any, hint: Any) -> Parameter:
 
 def refuse(model: Any, key: str, wanted: str) -> ModelError:
     """Return the error of a model's parameter that is not what is `wanted`, which has `key` and `wanted`, too."""
-    error = ModelError(f"{type(model).__name__}: {key} is {shown(vars(model)[key])}, expected {wanted}")
+    error = ModelError(f"{type(model).__name__}: {key} is {short_text(vars(model)[key])}, expected {wanted}")
     error.key, error.wanted = key, wanted
     return error
 
@@ -373,7 +377,7 @@ def _run(file: Path) -> ModuleType:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[name]
-        raise KalmarkError(f"{file} cannot be run: {type(error).__name__}: {error}{line_of(error)}") from None
+        raise KalmarkError(f"{file} cannot be run: {type(error).__name__}: {error}{line_of_error(error)}") from None
     return module
 
 
@@ -405,7 +409,7 @@ def register_by_file(role: str, name: str) -> bool:
     return model is not None
 
 
-def line_of(error: BaseException) -> str:
+def line_of_error(error: BaseException) -> str:
     """Return where in the user's file an error came from."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:

@@ -39,7 +39,7 @@ MOST_OTHER = 1e12  # of what has no unit, or another one: signatures, logarithms
 SYMBOLS = {"mps": "m/s", "radps": "rad/s"}
 
 
-def most(column: str) -> tuple[float, str]:
+def largest_magnitude(column: str) -> tuple[float, str]:
     """Return the largest magnitude of a column, or of a parameter, by the unit that its name ends in; and that unit."""
     unit = column.rpartition("_")[2]
     return (MOST[unit], SYMBOLS.get(unit, unit)) if unit in MOST else (MOST_OTHER, "")
@@ -47,7 +47,7 @@ def most(column: str) -> tuple[float, str]:
 
 def bound(column: str) -> str:
     """Return in words what is expected of a number that is too large."""
-    limit, unit = most(column)
+    limit, unit = largest_magnitude(column)
     return f"at most {limit:.0e} {unit}".strip()
 
 
@@ -55,24 +55,24 @@ def refuse_huge(value: Array, columns: tuple[str, ...], where: str) -> None:
     """Refuse numbers (..., m) in these columns that are larger than mean anything.  Raises EventError."""
     for column, numbers in zip(columns, value.reshape(-1, len(columns)).T, strict=True):
         worst = float(np.abs(numbers).max(initial=0.0))
-        if worst > most(column)[0]:
+        if worst > largest_magnitude(column)[0]:
             raise EventError(f"{where}: {column} is {worst:.3g}, expected {bound(column)}")
 
 
-def seconds(t_ns: int) -> str:
+def seconds_text(t_ns: int) -> str:
     """Return integer nanoseconds as text in seconds, exactly, without trailing zeros."""
     whole, rest = divmod(abs(t_ns), 1_000_000_000)
     return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}".rstrip("0").rstrip(".")
 
 
-def listed(names: Iterable[object], most: int = 3) -> str:
+def list_names(names: Iterable[object], most: int = 3) -> str:
     """Return names as a line shows them: the first ones, and how many more there are."""
-    texts = [shown(name) for name in names]
+    texts = [short_text(name) for name in names]
     more = [f"{len(texts) - most} more"] if len(texts) > most else []
     return ", ".join([*texts[:most], *more]) or "none"
 
 
-def shown(value: object) -> str:
+def short_text(value: object) -> str:
     """Return a value as a message shows it: on one line, and cut where it is long."""
     try:
         text = " ".join(repr(value).split())
@@ -86,7 +86,7 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def nanoseconds(t_s: Any, t_ns: Any, kind: str, robot: Any) -> int:
+def time_in_ns(t_s: Any, t_ns: Any, kind: str, robot: Any) -> int:
     """Return the time of an event in integer nanoseconds, from exactly one of seconds and nanoseconds."""
     if t_ns is None and isinstance(t_s, float) and -9e9 < t_s < 9e9:
         return round(t_s * 1e9)
@@ -95,12 +95,12 @@ def nanoseconds(t_s: Any, t_ns: Any, kind: str, robot: Any) -> int:
     try:
         return _nanoseconds(t_s, t_ns)
     except EventError as error:
-        raise EventError(f"{kind} of {shown(robot)}: {error}") from None
+        raise EventError(f"{kind} of {short_text(robot)}: {error}") from None
 
 
 def _nanoseconds(t_s: Any, t_ns: Any) -> int:
     if (t_s is None) == (t_ns is None):
-        raise EventError(f"expected exactly one of t_s and t_ns, got t_s={shown(t_s)} and t_ns={shown(t_ns)}")
+        raise EventError(f"expected exactly one of t_s and t_ns, got t_s={short_text(t_s)} and t_ns={short_text(t_ns)}")
     name, value, expected = "t_s", t_s, "a finite number of seconds"
     try:
         if t_s is None:
@@ -111,15 +111,15 @@ def _nanoseconds(t_s: Any, t_ns: Any) -> int:
             wrong = isinstance(t_s, bool | np.timedelta64) or not isinstance(t_s, Real)
             time = round(float("nan" if wrong else t_s) * 1e9)
     except (TypeError, ValueError, OverflowError):
-        raise EventError(f"{name} is {shown(value)}, expected {expected}") from None
+        raise EventError(f"{name} is {short_text(value)}, expected {expected}") from None
     if abs(time) >= LATEST_NS:
-        raise EventError(f"{name} is {shown(value)}, expected a time within 292 years of 0, 2**63 ns")
+        raise EventError(f"{name} is {short_text(value)}, expected a time within 292 years of 0, 2**63 ns")
     return time
 
 
 def finite(value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkError] = EventError) -> Array:
     """Return a copy of `value` as a float array (..., n); raise `error` if it is not finite or larger than `limit`."""
-    return measured(value, what, limit, error)[0]
+    return finite_and_largest(value, what, limit, error)[0]
 
 
 def unit_quaternion(q: Array, error: type[Exception] = EventError) -> Array:
@@ -133,17 +133,17 @@ def unit_quaternion(q: Array, error: type[Exception] = EventError) -> Array:
     return q if abs(norm - 1) < 1e-12 else np.asarray(q / norm)
 
 
-def measured(
+def finite_and_largest(
     value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkError] = EventError
 ) -> tuple[Array, float]:
     """Return what `finite` does, and the largest magnitude in it."""
     try:
         array = np.array(value, order="C")
     except (TypeError, ValueError):
-        raise error(f"{what} is {shown(value)}, expected numbers") from None
+        raise error(f"{what} is {short_text(value)}, expected numbers") from None
     if array.dtype is not FLOAT:
         if array.dtype.kind not in "iuf":
-            raise error(f"{what} is {shown(value)}, expected numbers")
+            raise error(f"{what} is {short_text(value)}, expected numbers")
         with np.errstate(over="ignore"):
             array = array.astype(FLOAT)
     flat = array.ravel()
@@ -167,17 +167,19 @@ def checked_id(value: Any, what: str) -> Id:
         value = value.item()
     if isinstance(value, str) and value:
         if len(value) > LONGEST_ID:
-            raise EventError(f"{what} is {shown(value)}, expected at most {LONGEST_ID} characters")
+            raise EventError(f"{what} is {short_text(value)}, expected at most {LONGEST_ID} characters")
         if not is_writable(value):
-            raise EventError(f"{what} is {shown(value)}, expected a text without control characters and surrogates")
+            raise EventError(
+                f"{what} is {short_text(value)}, expected a text without control characters and surrogates"
+            )
         return str(value)
     if isinstance(value, int) and not isinstance(value, bool):
         if abs(value) >= 10**LONGEST_ID:
-            raise EventError(f"{what} is {shown(value)}, expected at most {LONGEST_ID} digits")
+            raise EventError(f"{what} is {short_text(value)}, expected at most {LONGEST_ID} digits")
         return int(value)
     if isinstance(value, float) and value.is_integer():
         return int(value)
-    raise EventError(f"{what} is {shown(value)}, expected a whole number or a text that is not empty")
+    raise EventError(f"{what} is {short_text(value)}, expected a whole number or a text that is not empty")
 
 
 def checked_ids(ids: Any, count: int) -> tuple[Id | None, ...]:
@@ -187,7 +189,7 @@ def checked_ids(ids: Any, count: int) -> tuple[Id | None, ...]:
     try:
         ids = tuple(None if isinstance(ids, str | bytes | Mapping | Set) else ids)  # type: ignore[arg-type]
     except TypeError:
-        raise EventError(f"ids is {shown(ids)}, expected a list with one id for each observation") from None
+        raise EventError(f"ids is {short_text(ids)}, expected a list with one id for each observation") from None
     if len(ids) != count:
         raise EventError(f"{len(ids)} ids for {count} observations, expected one id each")
     ids = tuple([i if i is None or (type(i) is int and -_SHORT < i < _SHORT) else checked_id(i, "an id") for i in ids])
@@ -200,7 +202,7 @@ def checked_ids(ids: Any, count: int) -> tuple[Id | None, ...]:
 
 def _text(value: Any, what: str) -> str:
     if not isinstance(value, str):
-        raise EventError(f"{what} is {shown(value)}, expected a text")
+        raise EventError(f"{what} is {short_text(value)}, expected a text")
     return value
 
 
@@ -254,20 +256,20 @@ class Control(_Timed):
         uneven: Any = None,
     ) -> None:
         set_ = object.__setattr__
-        t_ns = nanoseconds(t_s, t_ns, "control", robot)
+        t_ns = time_in_ns(t_s, t_ns, "control", robot)
         try:
             if not is_number(share) or not 0.0 < share <= 1.0:
-                raise EventError(f"share is {shown(share)}, expected a number above 0 and at most 1")
+                raise EventError(f"share is {short_text(share)}, expected a number above 0 and at most 1")
             set_(self, "share", share)
             set_(self, "uneven", None if uneven is None else finite(uneven, "uneven", MOST_OTHER**2))
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
-            u, largest = measured(u, "u", MOST_OTHER)
+            u, largest = finite_and_largest(u, "u", MOST_OTHER)
             set_(self, "u", u)
             set_(self, "largest", largest)
             set_(self, "cov", None if cov is None else finite(cov, "cov", MOST_OTHER**2))
         except EventError as error:
-            raise EventError(f"control of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
+            raise EventError(f"control of {short_text(robot)} at t={seconds_text(t_ns)} s: {error}") from None
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
@@ -300,9 +302,9 @@ class Scan(_Timed):
         t_ns: int | None = None,
     ) -> None:
         set_ = object.__setattr__
-        t_ns = nanoseconds(t_s, t_ns, "scan", robot)
+        t_ns = time_in_ns(t_s, t_ns, "scan", robot)
         try:
-            y, largest = measured(y, "y", MOST_OTHER)
+            y, largest = finite_and_largest(y, "y", MOST_OTHER)
             y = _rows(y)
             set_(self, "largest", largest)
             set_(self, "t_ns", t_ns)
@@ -313,7 +315,7 @@ class Scan(_Timed):
             set_(self, "ids", None if ids is None else checked_ids(ids, len(y)))
             set_(self, "cov", None if cov is None else finite(cov, "cov", MOST_OTHER**2))
         except EventError as error:
-            what = f"scan of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
+            what = f"scan of {short_text(robot)} by {short_text(sensor)} at t={seconds_text(t_ns)} s"
             raise EventError(f"{what}: {error}") from None
 
 
@@ -330,7 +332,7 @@ class Fix(_Timed):
         self, t_s: float | None = None, robot: str = "", y: Any = (), cov: Any = None, *, t_ns: int | None = None
     ) -> None:
         set_ = object.__setattr__
-        t_ns = nanoseconds(t_s, t_ns, "fix", robot)
+        t_ns = time_in_ns(t_s, t_ns, "fix", robot)
         try:
             if cov is None:
                 raise EventError("cov is missing, expected a covariance in m^2")
@@ -339,7 +341,7 @@ class Fix(_Timed):
             set_(self, "y", finite(y, "y", MOST["m"]))
             set_(self, "cov", finite(cov, "cov", MOST["m"] ** 2))
         except EventError as error:
-            raise EventError(f"fix of {shown(robot)} at t={seconds(t_ns)} s: {error}") from None
+            raise EventError(f"fix of {short_text(robot)} at t={seconds_text(t_ns)} s: {error}") from None
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
@@ -371,7 +373,7 @@ class Frame(_Timed):
         t_ns: int | None = None,
     ) -> None:
         set_ = object.__setattr__
-        t_ns = nanoseconds(t_s, t_ns, "frame", robot)
+        t_ns = time_in_ns(t_s, t_ns, "frame", robot)
         try:
             set_(self, "t_ns", t_ns)
             set_(self, "robot", _text(robot, "robot"))
@@ -380,7 +382,7 @@ class Frame(_Timed):
             set_(self, "depth", depth if depth is None or callable(depth) else _depths(depth))
             set_(self, "right", right if right is None or callable(right) else _pixels(right))
         except EventError as error:
-            what = f"frame of {shown(robot)} by {shown(sensor)} at t={seconds(t_ns)} s"
+            what = f"frame of {short_text(robot)} by {short_text(sensor)} at t={seconds_text(t_ns)} s"
             raise EventError(f"{what}: {error}") from None
 
     def pixels(self) -> Any:
@@ -406,7 +408,7 @@ class Frame(_Timed):
         try:
             return checked(source()) if callable(source) else source
         except (EventError, OSError) as error:
-            raise ImageError(f"{when(self)}: {error}") from None
+            raise ImageError(f"{label_of_event(self)}: {error}") from None
 
 
 def _pixels(image: Any) -> Any:
@@ -435,9 +437,9 @@ Event = Control | Scan | Frame | Fix
 _RANK: dict[type, int] = {Control: 0, Scan: 1, Frame: 1, Fix: 2}
 
 
-def when(event: Event) -> str:
+def label_of_event(event: Event) -> str:
     """Return what kind of event it is and its time, for an error's line."""
-    return f"{type(event).__name__.lower()} at t={seconds(event.t_ns)} s"
+    return f"{type(event).__name__.lower()} at t={seconds_text(event.t_ns)} s"
 
 
 def kind_of(event: Event) -> tuple[str, str, str]:
@@ -445,7 +447,7 @@ def kind_of(event: Event) -> tuple[str, str, str]:
     return type(event).__name__, event.robot, event.sensor if isinstance(event, Scan | Frame) else ""
 
 
-def order(event: Event) -> tuple[int, int, str, str]:
+def sort_key(event: Event) -> tuple[int, int, str, str]:
     """Sort key of events: time, then Control, Scan or Frame, Fix, then robot, then sensor.
 
     A stable sort keeps arrival.
@@ -453,12 +455,12 @@ def order(event: Event) -> tuple[int, int, str, str]:
     return event.t_ns, _RANK[type(event)], event.robot, event.sensor if isinstance(event, Scan | Frame) else ""
 
 
-def in_order(events: list[Event]) -> list[Event]:
-    """Return events by `order`: of a long log in the memory of a list, where keys take some 200 bytes an event."""
+def sort_events(events: list[Event]) -> list[Event]:
+    """Return events by `sort_key`: of a long log in the memory of a list, where keys take some 200 bytes an event."""
     t_ns = np.fromiter((event.t_ns for event in events), np.int64, len(events))
     by_time = (events[k] for k in np.argsort(t_ns, kind="stable"))
     out: list[Event] = []
     for _, same in groupby(by_time, key=attrgetter("t_ns")):
         first, *others = same
-        out += sorted((first, *others), key=order) if others else (first,)
+        out += sorted((first, *others), key=sort_key) if others else (first,)
     return out

@@ -47,7 +47,7 @@ def write(path: Path, text: str) -> None:
 def replace_file(path: Path, writer: Callable[[Path], Any]) -> None:
     """Let `writer` write a temporary file beside `path`, then put it in its place, on the disk when this returns."""
     path = Path(os.path.realpath(path))
-    with _beside(path) as temporary:
+    with _unused_name(path) as temporary:
         writer(temporary)
         _sync(temporary)
         temporary.replace(path)
@@ -65,7 +65,7 @@ def replace_folder(folder: Path, writer: Callable[[Path], Any], own: Sequence[st
     folder.parent.mkdir(parents=True, exist_ok=True)
     stays = folder.is_dir() and (folder.is_mount() or folder.samefile(Path.cwd()))
     stays = stays or not os.access(folder.parent, os.W_OK)
-    with _beside(folder / folder.name if stays else folder) as made:
+    with _unused_name(folder / folder.name if stays else folder) as made:
         made.mkdir()
         writer(made)
         for path in made.rglob("*"):
@@ -75,7 +75,7 @@ def replace_folder(folder: Path, writer: Callable[[Path], Any], own: Sequence[st
                 made.rename(folder)
                 _sync(folder.parent)
                 return
-        with locked(folder):
+        with hold_lock(folder):
             if stays or not _exchanged(made, folder, own):
                 _put_in_place(made, folder, own, last)
         _sync(folder.parent)
@@ -136,7 +136,7 @@ def _is(name: str, patterns: Sequence[str]) -> bool:
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[Path]:
+def _unused_name(path: Path) -> Iterator[Path]:
     """Give an unused name beside a path, of its suffix; what is there at the end is removed."""
     head, tail = f".{path.stem[:40]}.", f".part{path.suffix}"  # names have 255 bytes at most
     for left in path.parent.glob(f"{glob.escape(head)}*{glob.escape(tail)}"):
@@ -168,7 +168,7 @@ def _sync(path: Path) -> None:
 
 
 @contextmanager
-def locked(path: Path, shared: bool = False, wait_s: float | None = None) -> Iterator[bool]:
+def hold_lock(path: Path, shared: bool = False, wait_s: float | None = None) -> Iterator[bool]:
     """Hold the lock of a folder, or of a file NAME.lock, which is made if it is missing; yield whether it was got.
 
     Waits for other programs, for at most `wait_s`.  Goes on without where the system has no locks or cannot open it.
@@ -250,10 +250,10 @@ def refuse_aliases(content: Any, where: str, error: type[KalmarkError]) -> None:
         raise error(f"{where}: its aliases make more than {MOST_NODES} values of it, expected fewer")
 
 
-def unpacked(path: Path, error: type[KalmarkError]) -> Iterator[bytes]:
+def unpack_file(path: Path, error: type[KalmarkError]) -> Iterator[bytes]:
     """Yield a .gz or .bz2 file unpacked, piece by piece.  Raises `error` if it is damaged or unpacks to too much."""
     try:
-        most = most_unpacked(path)
+        most = unpacked_limit(path)
         with (bz2.open if path.suffix == ".bz2" else gzip.open)(path) as file:
             while piece := file.read(PIECE):
                 if file.tell() > most:
@@ -263,13 +263,13 @@ def unpacked(path: Path, error: type[KalmarkError]) -> Iterator[bytes]:
         raise error(f"{path}: cannot be unpacked ({damage}), expected a complete file") from None
 
 
-def most_unpacked(path: Path) -> int:
+def unpacked_limit(path: Path) -> int:
     """Return how many bytes a compressed file of this size may unpack to."""
     return FREE_BYTES + MOST_PACKED * path.stat().st_size
 
 
 def refuse_bomb(archive: zipfile.ZipFile, path: Path, error: type[KalmarkError]) -> None:
     """Refuse an archive whose members have sizes far larger than the file, before any of them is unpacked."""
-    size, most = sum(member.file_size for member in archive.infolist()), most_unpacked(path)
+    size, most = sum(member.file_size for member in archive.infolist()), unpacked_limit(path)
     if size > most:
         raise error(f"{path}: {size} bytes in a file of {path.stat().st_size}, expected at most {most}")

@@ -26,16 +26,16 @@ def _installed() -> Any:
 
 
 @cache
-def found(group: str) -> dict[str, EntryPoint]:
+def entry_points_of(group: str) -> dict[str, EntryPoint]:
     """Return the entry points of `kalmark.GROUP` by name, none of them loaded."""
     return {entry.name: entry for entry in _installed().select(group=f"kalmark.{group}")}
 
 
 def load(group: str, name: str) -> Any:
     """Return what an entry point names.  Raises PluginError if no package has it, or if it cannot be loaded."""
-    if name not in found(group):
+    if name not in entry_points_of(group):
         raise PluginError(f"no installed package has {name!r} among its kalmark.{group}, expected one")
-    entry = found(group)[name]
+    entry = entry_points_of(group)[name]
     try:
         return entry.load()
     except Exception as error:
@@ -46,7 +46,7 @@ def load_all(group: str) -> tuple[dict[str, Any], dict[str, PluginError]]:
     """Return what the entry points of a group name, and the errors of those that cannot be loaded, both by name."""
     loaded: dict[str, Any] = {}
     failed: dict[str, PluginError] = {}
-    for name in found(group):
+    for name in entry_points_of(group):
         try:
             loaded[name] = load(group, name)
         except PluginError as error:

@@ -12,7 +12,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.errors import MapError
-from kalmark.events import Event, Id, Scan, seconds
+from kalmark.events import Event, Id, Scan, seconds_text
 from kalmark.filter.estimators import Correction
 from kalmark.geometry.gaussian import ellipses
 
@@ -278,7 +278,7 @@ class Report:
     def __repr__(self) -> str:
         counts = {o: sum(obs.outcome == o for obs in self.observations) for o in OUTCOMES}
         text = ", ".join(f"{n} {o}" for o, n in counts.items() if n) or "no observations"
-        return f"<Report of {type(self.event).__name__} at t={seconds(self.event.t_ns)} s: {text}>"
+        return f"<Report of {type(self.event).__name__} at t={seconds_text(self.event.t_ns)} s: {text}>"
 
 
 class LandmarkEstimate(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.association.gated import assigned
+from kalmark.association.gated import assign
 from kalmark.association.protocol import NEW, averages, new_gate, weighs
 from matched_points import Asked, Points
 
@@ -18,11 +18,11 @@ ROWS = np.arange(2)
 
 
 def test_an_assignment_has_the_least_sum_and_none_counts_as_the_gate() -> None:
-    assert assigned(np.array([[1.0, 2.0], [1.5, 9.0]]), 10.0).tolist() == [1, 0], "2 + 1.5 < 1 + 9"
+    assert assign(np.array([[1.0, 2.0], [1.5, 9.0]]), 10.0).tolist() == [1, 0], "2 + 1.5 < 1 + 9"
     d2 = np.array([[1.0, 7.5], [2.0, 30.0]])
-    assert assigned(d2, 9.0).tolist() == [1, 0], "7.5 + 2 < 1 + gate"
-    assert assigned(np.where(d2 == 7.5, 8.5, d2), 9.0).tolist() == [0, -1], "1 + gate < 8.5 + 2"
-    assert assigned(np.array([[9.1]]), 9.0).tolist() == [-1]
+    assert assign(d2, 9.0).tolist() == [1, 0], "7.5 + 2 < 1 + gate"
+    assert assign(np.where(d2 == 7.5, 8.5, d2), 9.0).tolist() == [0, -1], "1 + gate < 8.5 + 2"
+    assert assign(np.array([[9.1]]), 9.0).tolist() == [-1]
 
 
 def test_the_nearest_pair_goes_first_and_what_it_takes_is_taken() -> None:

@@ -17,11 +17,11 @@ from kalmark.association.global_start import (
     by_chance,
     distinct,
     hypotheses,
-    placed,
-    refined,
+    points_at_poses,
+    refine_pose,
     search,
 )
-from kalmark.association.relocalization import aligned, relocalized, same
+from kalmark.association.relocalization import align_points, is_same_pose, relocalize
 from kalmark.geometry.frames import to_frame
 from kalmark.tracks.known_landmarks import Known
 from matched_points import Asked, Points
@@ -54,13 +54,15 @@ def test_two_observations_are_of_two_landmarks_from_two_poses() -> None:
 
 def test_places_are_turned_and_shifted() -> None:
     poses = np.array([[1.0, 2.0, np.pi / 2], [0.0, 0.0, np.pi]])
-    np.testing.assert_allclose(placed(poses, np.array([[1.0, 0.0]])), [[[1.0, 3.0]], [[-1.0, 0.0]]], atol=1e-12)
+    np.testing.assert_allclose(
+        points_at_poses(poses, np.array([[1.0, 0.0]])), [[[1.0, 3.0]], [[-1.0, 0.0]]], atol=1e-12
+    )
 
 
 def test_a_pose_that_most_of_a_scan_agrees_with_is_kept_with_its_pairs() -> None:
     v = to_frame(T, PLACES[[1, 3, 4]])[0]
     poses = np.array([T + np.array([0.0, 0.0, 0.3]), T])
-    (one,) = global_start.tested(known(PLACES), v, SIGMA[:3], poses, (0, 1))
+    (one,) = global_start.supported_poses(known(PLACES), v, SIGMA[:3], poses, (0, 1))
     np.testing.assert_array_equal(one.T, T)
     assert one.matched.tolist() == [1, 3, 4]
 
@@ -71,18 +73,18 @@ def test_a_pose_is_refined_to_the_least_squares_of_all_pairs_and_each_landmark_h
     v = np.vstack([v, v[2] + 0.02])  # a second one of the third landmark, farther off
     sigma = np.full(7, 0.01)
     start = GlobalPose(T + np.array([0.02, -0.02, 0.002]), np.array([0, 1, 2, 3, -1, -1, -1]))
-    found = refined(known(PLACES), v, sigma, start)
+    found = refine_pose(known(PLACES), v, sigma, start)
     assert found.matched.tolist()[:6] == [*range(6)]
     assert found.matched[6] == -1
-    again = aligned(v[:6], PLACES, sigma[:6] ** -2)
+    again = align_points(v[:6], PLACES, sigma[:6] ** -2)
     np.testing.assert_allclose(found.T, again, atol=0.01)
     assert np.abs(found.T - T).max() < 0.02
 
 
 def test_poses_are_one_within_half_a_metre_and_a_tenth_of_a_radian() -> None:
-    assert same(T, T + np.array([0.3, 0.39, 0.0])) and not same(T, T + np.array([0.3, 0.41, 0.0]))
-    assert same(T, T + np.array([0.0, 0.0, 0.099])) and not same(T, T + np.array([0.0, 0.0, 0.101]))
-    assert same(np.array([0.0, 0.0, 3.13]), np.array([0.0, 0.0, -3.13])), "across the seam"
+    assert is_same_pose(T, T + np.array([0.3, 0.39, 0.0])) and not is_same_pose(T, T + np.array([0.3, 0.41, 0.0]))
+    assert is_same_pose(T, T + np.array([0.0, 0.0, 0.099])) and not is_same_pose(T, T + np.array([0.0, 0.0, 0.101]))
+    assert is_same_pose(np.array([0.0, 0.0, 3.13]), np.array([0.0, 0.0, -3.13])), "across the seam"
     poses = [
         GlobalPose(T + np.array([0.1, 0, 0]), np.array([0, -1])),
         GlobalPose(T, np.array([0, 1])),
@@ -126,15 +128,15 @@ def asked(places: np.ndarray, v: np.ndarray, ids: Any = None) -> Any:
 def test_a_scan_relocalises_by_its_ids_or_by_its_distances_alone() -> None:
     v = to_frame(T, PLACES)[0]
     for ids in ((0, 1, 2, 3, 4, 5), (0, 1, 2, "strange", "strange", "strange"), None):
-        np.testing.assert_allclose(relocalized(asked(PLACES, v, ids)), T, atol=1e-9)
+        np.testing.assert_allclose(relocalize(asked(PLACES, v, ids)), T, atol=1e-9)
 
 
 def test_a_scan_that_fits_nowhere_in_two_places_or_by_half_relocalises_nothing() -> None:
     v = to_frame(T, PLACES)[0]
-    assert relocalized(asked(PLACES, v, (1, 0, 2, 3, 4, 5))) is None, "ids that are exchanged do not fit"
-    assert relocalized(asked(PLACES, v, (0, 1, "s", "s", "s", "s"))) is None, "two are too few"
+    assert relocalize(asked(PLACES, v, (1, 0, 2, 3, 4, 5))) is None, "ids that are exchanged do not fit"
+    assert relocalize(asked(PLACES, v, (0, 1, "s", "s", "s", "s"))) is None, "two are too few"
     square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
-    assert relocalized(asked(square, to_frame(T, square)[0])) is None, "it fits from four places"
+    assert relocalize(asked(square, to_frame(T, square)[0])) is None, "it fits from four places"
     strange = np.array([[50.0, 50.0], [70.0, -40.0], [-60.0, 33.0]])
-    assert relocalized(asked(PLACES, np.vstack([v[:3], strange]))) is None, "half of it is strange"
-    np.testing.assert_allclose(relocalized(asked(PLACES, np.vstack([v[:4], strange]))), T, atol=1e-9)
+    assert relocalize(asked(PLACES, np.vstack([v[:3], strange]))) is None, "half of it is strange"
+    np.testing.assert_allclose(relocalize(asked(PLACES, np.vstack([v[:4], strange]))), T, atol=1e-9)

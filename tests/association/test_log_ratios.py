@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import kalmark as km
-from kalmark.association.ratio import LogRatios, doubtful, log_density_about, log_ratios
+from kalmark.association.ratio import LogRatios, doubtful_pairs, log_density_about, log_ratios
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry import POINT2
 from kalmark.tracks.track import Track, Tracks
@@ -58,7 +58,7 @@ def test_groups_are_accepted_at_their_joint_odds(
     ratio: list[float], bound: list[float], given: int, out: list[int]
 ) -> None:
     found = LogRatios([*range(len(ratio))], np.array(ratio), np.array(bound))
-    assert doubtful(found, given, 1000.0) == out
+    assert doubtful_pairs(found, given, 1000.0) == out
 
 
 def test_the_density_about_landmarks_is_that_of_those_observed_with_them_or_of_the_space_seen() -> None:

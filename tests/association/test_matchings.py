@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kalmark.association.matchings import agree, best_matching, extend, matchings, narrow, possible
+from kalmark.association.matchings import agree, best_matching, count_possible, extend, matchings, narrow
 
 SEEN = np.array([[0.0, 0.0], [3.0, 4.0]])  # 5 m apart
 KNOWN = np.array([[1.0, 1.0], [1.0, 6.2]])  # 5.2 m apart
@@ -40,7 +40,7 @@ def test_a_pair_leaves_those_of_other_observations_and_landmarks_that_agree_with
 
 def test_observations_that_may_still_be_paired_are_counted() -> None:
     alive, first = np.array([True, False, False, False, True]), np.array([0, 1, 3, 5])
-    assert [possible(alive, first, i) for i in range(4)] == [2, 1, 1, 0]
+    assert [count_possible(alive, first, i) for i in range(4)] == [2, 1, 1, 0]
 
 
 def test_points_on_a_line_at_equal_distances_match_each_other_shifted_and_reversed() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from kalmark.association.posterior import Posterior, added, agreeing, expected_in_gate, posterior
+from kalmark.association.posterior import Posterior, consistent_matchings, expected_in_gate, least_increase, posterior
 from kalmark.geometry.gaussian import gate
 from matched_points import Points
 
@@ -67,7 +67,7 @@ def test_of_two_shifts_of_a_line_each_is_as_likely_and_of_another_pose() -> None
 
 def test_agreement_keeps_pairs_of_equal_distances_whatever_the_pose() -> None:
     points = Points([[50.0, 50.0], [50.0, 52.0], [54.0, 50.0]], [[0.0, 0.0], [0.0, 2.0], [4.0, 0.0], [30.0, 0.0]])
-    found, finished = agreeing(points, np.arange(3), points.distances(), np.ones((3, 4), bool), 0.99, MOST)
+    found, finished = consistent_matchings(points, np.arange(3), points.distances(), np.ones((3, 4), bool), 0.99, MOST)
     assert finished
     exchanged = [[1, 0, -1], [2, -1, 0], [-1, 2, 1]]  # both ends of one distance, with a pair less
     assert sorted(found.tolist()) == sorted([[0, 1, 2], *exchanged])
@@ -82,9 +82,9 @@ def test_landmarks_in_a_gate_are_counted_over_the_volume_that_was_searched() -> 
 def test_a_pair_adds_to_a_matching_what_the_joint_d2_grows_by() -> None:
     """The first pair shows the shift of .3 m: from there the second observation is .1 m off, by 2 noises of 1 cm."""
     points = Points([[0.3, 0.0], [2.4, 0.0]], LINE, S=1e4)
-    least = added(points, np.arange(2), np.array([0, -1]), 1, np.arange(3))
+    least = least_increase(points, np.arange(2), np.array([0, -1]), 1, np.arange(3))
     assert least == pytest.approx(0.1**2 / (2 * 1e-4), rel=1e-4)
-    assert added(points, np.arange(2), np.array([0, -1]), 1, np.array([0])) == np.inf, "0 is taken"
+    assert least_increase(points, np.arange(2), np.array([0, -1]), 1, np.array([0])) == np.inf, "0 is taken"
 
 
 FOUND = Posterior(np.array([[0, 1], [0, -1], [2, 1]]), np.array([0.5, 0.3, 0.2]), 0.0, 0, True)

@@ -13,7 +13,7 @@ from kalmark.config import build_slam, open_run
 from kalmark.errors import LogError
 from kalmark.events import Control, Fix, Scan
 from kalmark.logs import open_log, write_native
-from kalmark.logs.geodesy import A_M, E2, FLATTENING, earth_centred, local
+from kalmark.logs.geodesy import A_M, E2, FLATTENING, earth_centred, to_tangent_plane
 from kalmark.results.record import record
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")
@@ -32,7 +32,7 @@ from ros_bags import (
     events_of,
     fix,
     geodetic,
-    header,
+    header_fields,
     odometry,
     pose,
     same_logs,
@@ -97,9 +97,11 @@ def test_the_controls_are_the_differences_of_the_poses(bags: dict[str, Path]) ->
 
 def test_increments_end_at_the_scans_where_odometry_is_slower_than_them(tmp_path: Path) -> None:
     messages = [odometry(T0 + t * 10**9, pose(2 * t, 0, 0.1 * t)) for t in range(3)]
-    seen = {"header": header(T0, "sonar"), "range": 2.0, "max_range": 9.0}
+    seen = {"header": header_fields(T0, "sonar"), "range": 2.0, "max_range": 9.0}
     for t in (5 * 10**8, 75 * 10**7, 15 * 10**8, 25 * 10**8):
-        messages.append(Outgoing("/sonar", "sensor_msgs/msg/Range", T0 + t, seen | {"header": header(T0 + t, "s")}))
+        messages.append(
+            Outgoing("/sonar", "sensor_msgs/msg/Range", T0 + t, seen | {"header": header_fields(T0 + t, "s")})
+        )
     path = bag_of(tmp_path, sorted(messages, key=lambda message: message.t_ns))
     topics = {"/odom": {"type": "odometry_2d", "at": "scans"}, "/sonar": {"type": "scan", "landmark": 1}}
     log = open_log(path, topics=topics)
@@ -137,7 +139,7 @@ def test_frames_of_tf_are_odometry_truth_and_mounts(bags: dict[str, Path]) -> No
 
 def test_a_laser_that_hangs_upside_down_sees_the_same(tmp_path: Path) -> None:
     flipped = {"position": {"x": 0.2}, "orientation": {"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}}
-    scan = {"header": header(T0, "laser"), "angle_min": -0.5, "angle_increment": 0.25, "range_max": 9.0}
+    scan = {"header": header_fields(T0, "laser"), "angle_min": -0.5, "angle_increment": 0.25, "range_max": 9.0}
     scan |= {"ranges": [1.0, 2.0, np.inf, 4.0, 5.0]}
     messages = [
         tf("/tf_static", T0, transform("base_link", "laser", T0, flipped)),
@@ -157,17 +159,17 @@ def test_a_degree_of_latitude_and_longitude_has_its_length() -> None:
     for lat in (-60.0, 0.0, 48.1, 89.0):
         w = np.sqrt(1 - E2 * np.sin(np.radians(lat)) ** 2)
         step = 1e-5
-        north = local([lat + step, 11.0, 0.0], [lat, 11.0, 0.0])
-        east = local([lat, 11.0 + step, 0.0], [lat, 11.0, 0.0])
+        north = to_tangent_plane([lat + step, 11.0, 0.0], [lat, 11.0, 0.0])
+        east = to_tangent_plane([lat, 11.0 + step, 0.0], [lat, 11.0, 0.0])
         np.testing.assert_allclose(north[1] / np.radians(step), A_M * (1 - E2) / w**3, rtol=1e-6)
         np.testing.assert_allclose(east[0] / np.radians(step), A_M / w * np.cos(np.radians(lat)), rtol=1e-6)
-        np.testing.assert_allclose(local([lat, 11.0, 7.0], [lat, 11.0, 2.0]), [0, 0, 5], atol=1e-8)
+        np.testing.assert_allclose(to_tangent_plane([lat, 11.0, 7.0], [lat, 11.0, 2.0]), [0, 0, 5], atol=1e-8)
 
 
 def test_the_poles_and_the_equator_are_where_the_ellipsoid_has_them() -> None:
     np.testing.assert_allclose(earth_centred([0, 0, 0]), [A_M, 0, 0], atol=1e-8)
     np.testing.assert_allclose(earth_centred([90, 0, 0]), [0, 0, A_M * (1 - FLATTENING)], atol=1e-8)
-    np.testing.assert_allclose(local(geodetic([120.0, -35.0, 4.0]), ORIGIN), [120, -35, 4], atol=1e-6)
+    np.testing.assert_allclose(to_tangent_plane(geodetic([120.0, -35.0, 4.0]), ORIGIN), [120, -35, 4], atol=1e-6)
 
 
 def test_messages_without_a_fix_are_left_out(tmp_path: Path) -> None:
@@ -209,7 +211,7 @@ def test_a_satellite_truth_only_scores(tmp_path: Path) -> None:
 def test_velocities_are_controls(
     kind: str, fields: dict[str, Any], topic: dict[str, Any], u: list[float], tmp_path: Path
 ) -> None:
-    stamped = {"header": header(T0 + 5, "base_link")} if "Stamped" in kind else {}
+    stamped = {"header": header_fields(T0 + 5, "base_link")} if "Stamped" in kind else {}
     path = bag_of(tmp_path, [Outgoing("/drive", kind, T0, stamped | fields)])
     (control,) = open_log(path, topics={"/drive": topic}).events
     assert isinstance(control, Control) and control.u.tolist() == u
@@ -283,7 +285,7 @@ def hypotheses(*named: tuple[str, float]) -> list[dict[str, Any]]:
 def test_observations_are_scans(
     kind: str, fields: dict[str, Any], topic: dict[str, Any], y: list[Any], ids: Any, tmp_path: Path
 ) -> None:
-    stamped = {} if kind.endswith("visualization_msgs/msg/MarkerArray") else {"header": header(T0, "camera")}
+    stamped = {} if kind.endswith("visualization_msgs/msg/MarkerArray") else {"header": header_fields(T0, "camera")}
     path = bag_of(tmp_path, [Outgoing("/seen", kind, T0, stamped | fields)])
     (scan,) = open_log(path, topics={"/seen": {"type": "scan"} | topic}).events
     assert isinstance(scan, Scan) and scan.sensor == "seen" and scan.ids == ids
@@ -320,8 +322,8 @@ def cloud(points: np.ndarray, names: str = "x y z id") -> dict[str, Any]:
         for name in kind.names
     ]
     return {
-        "header": header(T0, "lidar"), "height": 1, "width": len(rows), "fields": fields, "point_step": kind.itemsize,
-        "row_step": rows.nbytes, "data": rows.view(np.uint8),
+        "header": header_fields(T0, "lidar"), "height": 1, "width": len(rows), "fields": fields,
+        "point_step": kind.itemsize, "row_step": rows.nbytes, "data": rows.view(np.uint8),
     }  # fmt: skip
 
 
@@ -344,7 +346,7 @@ def test_what_a_camera_sees_is_made_level_for_a_robot_of_the_plane(tmp_path: Pat
         odometry(T0, pose(0, 0, 0)),
         odometry(T0 + 1, pose(0, 0, 0)),
         Outgoing("/seen", "visualization_msgs/msg/MarkerArray", T0,
-                 {"markers": [{"id": 4, "header": header(T0, "camera"), "pose": ahead}]}),
+                 {"markers": [{"id": 4, "header": header_fields(T0, "camera"), "pose": ahead}]}),
     ]  # fmt: skip
     log = open_log(bag_of(tmp_path, messages), topics={"/odom": TOPICS["/odom"], "/seen": {"type": "scan"}})
     scan = next(event for event in log.events if isinstance(event, Scan))

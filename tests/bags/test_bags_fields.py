@@ -19,7 +19,7 @@ pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be r
 import ros_bags
 from kalmark.bags.first_config import first_config
 from kalmark.bags.survey import survey
-from ros_bags import KINDS, T0, TOPICS, Outgoing, bag_of, header, odometry, pose
+from ros_bags import KINDS, T0, TOPICS, Outgoing, bag_of, header_fields, odometry, pose
 
 OWN = {
     "uwb_msgs/msg/Range": "std_msgs/Header header\nuint8 anchor_id\nuint16 distance\n",
@@ -42,7 +42,7 @@ def messages() -> list[Outgoing]:
     """Return odometry, and at each of its poses one message of each of the other types."""
     out = []
     for k in range(3):
-        t, head = T0 + k * 10**9, {"header": header(T0 + k * 10**9, "sensor")}
+        t, head = T0 + k * 10**9, {"header": header_fields(T0 + k * 10**9, "sensor")}
         cones = [{"id": i, "position": {"x": x - k, "y": y, "z": 0.0}} for i, (x, y) in CONES]
         x, y = np.array([p for _, p in CONES]).T - [[k], [0]]
         lists = {"ids": [i for i, _ in CONES], "ranges": np.hypot(x, y), "bearings": np.arctan2(y, x)}

@@ -21,7 +21,7 @@ from ros_bags import (
     Outgoing,
     bag_of,
     events_of,
-    header,
+    header_fields,
     odometry,
     pose,
     same,
@@ -104,7 +104,8 @@ def test_bad_messages_are_refused_or_left_out(tmp_path: Path) -> None:
 
 def test_a_type_that_the_bag_does_not_define_gets_one_line(tmp_path: Path) -> None:
     """As older ROS 2 bags in sqlite3 are: without definitions, of which ROS's own are known."""
-    path = bag_of(tmp_path, [Outgoing("/tags", "aruco_msgs/msg/MarkerArray", T0, {"header": header(T0, "camera")}),
+    header = header_fields(T0, "camera")
+    path = bag_of(tmp_path, [Outgoing("/tags", "aruco_msgs/msg/MarkerArray", T0, {"header": header}),
                              odometry(T0, pose(0, 0, 0)), odometry(T0 + 9, pose(1, 0, 0))], "sqlite3")  # fmt: skip
     with sqlite3.connect(next(path.glob("*.db3"))) as database:
         database.execute("delete from message_definitions")

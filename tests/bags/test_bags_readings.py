@@ -24,7 +24,7 @@ from ros_bags import (
     Outgoing,
     bag_of,
     field,
-    header,
+    header_fields,
     imu,
     odometry,
     pose,
@@ -158,7 +158,7 @@ def test_an_inertial_unit_moves_a_robot_whose_frame_is_its_own(tmp_path: Path) -
     mount = tf("/tf_static", T0, transform("base_link", "imu", T0, pose(1, 0, 0)))
     camera = tf("/tf_static", T0, transform("base_link", "camera", T0, pose(3, 0, 0)))
     units = [imu(T0 + k * 10**7, (0.1, 0.2, 0.3 + k), a=(0.0, 0.1, 9.8)) for k in range(3)]
-    seen = {"markers": [{"id": 4, "header": header(T0, "camera"), "pose": AT}]}
+    seen = {"markers": [{"id": 4, "header": header_fields(T0, "camera"), "pose": AT}]}
     messages = [mount, camera, *units, units[2], Outgoing("/seen", "visualization_msgs/msg/MarkerArray", T0, seen)]
     topics = {"/imu": {"type": "inertial"}, "level": {"type": "imu", "topic": "/imu", "gyro": "gyro"}}
     log = open_log(bag_of(tmp_path, messages), topics=topics | {"/seen": {"type": "scan"}})

@@ -13,18 +13,18 @@ import pytest
 import kalmark as km
 from batch_dense import Link, Sight, link, optimum
 from kalmark.batch.batch_state import POSES, BatchState, plus
-from kalmark.batch.data import replayed
+from kalmark.batch.data import replay_events
 from kalmark.batch.problem import Rows
 from kalmark.batch.solver import Batch
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
-from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.events import Control, Event, Fix, Scan, sort_key
 from kalmark.geometry import V, wrap
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import POINT2
 from kalmark.logs import open_log
 from kalmark.logs.native_writer import write_native
-from kalmark.results.batch import batch_entry, compare, given_by, solve_batch
+from kalmark.results.batch import batch_entry, batch_input, compare_with_filter, solve_batch
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
@@ -145,7 +145,7 @@ def test_a_held_error_shared_by_the_parts_of_a_split_control_equals_dense_least_
         sights += [Sight(len(links) - 1, i, row, SIGMA, MOUNT) for i, row in enumerate(y)]
         nodes.append(len(links) - 1)
         before = t
-    events.sort(key=order)
+    events.sort(key=sort_key)
     batch = solve_batch(filtered([robot("r", motion)], events), events)
     assert_equal(batch, optimum(links, sights, LANDMARKS), nodes)
 
@@ -184,7 +184,7 @@ def test_exact_data_leave_no_residual_and_give_the_truth() -> None:
 
 def test_the_hessian_is_the_derivative_of_the_gradient() -> None:
     events, *_ = odometry_log()
-    problem = replayed(given_by(filtered([robot("r", ODOMETRY)], events)), events)
+    problem = replay_events(batch_input(filtered([robot("r", ODOMETRY)], events)), events)
     start = problem.start
     n = len(start.groups[POSES])
     m = 50 * np.random.default_rng(0).normal(size=3 * n)
@@ -201,7 +201,7 @@ def test_the_hessian_is_the_derivative_of_the_gradient() -> None:
 def test_the_gradient_of_a_robust_factor_is_the_derivative_of_its_sum() -> None:
     """Residuals within and beyond the length of Huber side by side: those within count in full."""
     events, *_ = odometry_log()
-    problem = replayed(given_by(filtered([robot("r", ODOMETRY)], events)), events)
+    problem = replay_events(batch_input(filtered([robot("r", ODOMETRY)], events)), events)
     factor, start, rng = replace(problem.factors[0], huber=3.0), problem.start, np.random.default_rng(0)
     x = np.concatenate([start.groups[POSES].ravel(), start.groups[1].ravel()])
     n, x = 3 * len(start.groups[POSES]), x + 0.1 * rng.normal(size=len(x))
@@ -329,7 +329,7 @@ def test_a_saved_run_finds_its_log_again(tmp_path: Path) -> None:
     run = record(slam_for(circle()), log, progress=False)
     run.save(tmp_path / "run")
     loaded = Run.load(tmp_path / "run")
-    found, wanted = loaded.evaluate(batch=True)["batch"], compare(run, solve_batch(run, log))
+    found, wanted = loaded.evaluate(batch=True)["batch"], compare_with_filter(run, solve_batch(run, log))
     for one, other in zip(found.pop("pose_differences"), wanted.pop("pose_differences"), strict=True):
         assert one.pop("robot") == other.pop("robot")
         assert one == pytest.approx(other, rel=1e-6)
@@ -357,7 +357,7 @@ def test_a_landmark_that_is_not_determined_is_refused() -> None:
 def test_without_truth_there_is_no_path_ratio() -> None:
     log = circle(truth=False)
     run = record(slam_for(log), log, progress=False)
-    figures = compare(run, solve_batch(run, log))
+    figures = compare_with_filter(run, solve_batch(run, log))
     assert figures["path_ratio"] is None
     assert figures["path_difference_m"] < 0.5
     assert figures["landmarks"] == len(run.landmarks)
@@ -377,7 +377,7 @@ def test_on_lost_in_the_woods_within_1_m_only_the_invariant_filter_knows_what_it
     config = load_config("lost_in_the_woods", ["log.r_max=1.0", f"estimator.type={estimator}"])
     log = open_config_log(config)
     run = record(build_slam(config, log), log, progress=False)
-    figures = compare(run, solve_batch(run, log, progress=False))
+    figures = compare_with_filter(run, solve_batch(run, log, progress=False))
     assert low < figures["sigma_ratio"] < high
     if estimator == "invariant":
         assert figures["map_difference_sigma"] < 0.2
@@ -389,4 +389,4 @@ def test_readings_of_the_state_and_range_rates_are_not_in_the_batch_solution(nam
     log = simulate(world, seed=1)
     run = record(build_slam(world.config(), log), log, progress=False)
     assert set(run.history.sensor.tolist()) > used
-    assert set(given_by(run).associations.sensor.tolist()) == used
+    assert set(batch_input(run).associations.sensor.tolist()) == used

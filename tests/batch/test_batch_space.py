@@ -11,13 +11,13 @@ from scipy.optimize import least_squares
 
 import kalmark as km
 from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
-from kalmark.batch.data import replayed
+from kalmark.batch.data import replay_events
 from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry import frames3d, rotations
 from kalmark.geometry.spaces import SE3
-from kalmark.results.batch import compare, given_by, solve_batch
+from kalmark.results.batch import batch_input, compare_with_filter, solve_batch
 from kalmark.results.record import record
 from kalmark.results.run import Run
 
@@ -131,7 +131,7 @@ def test_odometry_points_and_pixels_equal_dense_least_squares() -> None:
 def test_the_hessian_in_space_is_the_derivative_of_the_gradient() -> None:
     names = ("lidar", "camera")
     events, *_ = odometry_log(3, 3, names)
-    problem = replayed(given_by(filtered(robot(ODOMETRY, names), events)), events)
+    problem = replay_events(batch_input(filtered(robot(ODOMETRY, names), events)), events)
     start = problem.start
     n = len(start.groups[POSES])
     m = 50 * np.random.default_rng(0).normal(size=6 * n)
@@ -165,7 +165,7 @@ def test_points_that_a_camera_started_by_their_inverse_depth_are_euclidean_in_th
     error = batch.means - landmarks[batch.ids]
     d2 = np.einsum("ki,kij,kj->k", error, np.linalg.inv(batch.covariances), error)
     assert d2.max() < 16.3  # 99.9 %
-    figures = compare(run, batch)
+    figures = compare_with_filter(run, batch)
     assert 0.8 < figures["sigma_ratio"] < 1.2
     assert figures["map_difference_sigma"] < 2.0  # a filter of rays is not as near its optimum as one of points
 
@@ -182,9 +182,9 @@ def test_velocities_held_across_scans_share_their_error() -> None:
             events += scans(there, k + part, landmarks, ("stereo",), rng)
         pose = motion.move(pose, TURN, 1.0)[0]
     run = filtered(robot(motion, ("stereo",)), events)
-    motions = replayed(given_by(run), events).motions
+    motions = replay_events(batch_input(run), events).motions
     assert abs(motions.Q[6:12, 12:18]).max() > 1e-4
-    figures = compare(run, solve_batch(run, events))
+    figures = compare_with_filter(run, solve_batch(run, events))
     assert 0.9 < figures["sigma_ratio"] < 1.1
     assert figures["map_difference_sigma"] < 0.5
     assert figures["chi2_per_dof"] == pytest.approx(1.0, abs=0.2)

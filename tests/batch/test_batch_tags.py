@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 import kalmark as km
 from kalmark.batch.batch_state import FIRST_MOUNT
-from kalmark.batch.data import Associations, BatchInput, replayed
+from kalmark.batch.data import Associations, BatchInput, replay_events
 from kalmark.batch.solver import optimum
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames3d, rotations
@@ -129,7 +129,7 @@ def adjust(
         huber=2 * huber_px / sigma_px,
     )
     rows = np.split(np.arange(len(ids)), first[1:])
-    problem = replayed(
+    problem = replay_events(
         given,
         (
             km.Scan(t_ns=t, robot="rig", sensor=names[k[0]], y=seen.y[k])

@@ -11,12 +11,12 @@ import pytest
 from hall import hall, mapped
 
 import kalmark as km
-from kalmark.batch.data import BatchReplay, replayed
-from kalmark.batch.reassociation import Reassociated, reassociated
+from kalmark.batch.data import BatchReplay, replay_events
+from kalmark.batch.reassociation import Reassociated, reassociate
 from kalmark.batch.solver import optimum
 from kalmark.config import build_slam
 from kalmark.logs.log import Log
-from kalmark.results.batch import batch_entry, given_by
+from kalmark.results.batch import batch_entry, batch_input
 from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 
@@ -32,9 +32,9 @@ def known() -> tuple[Run, Log]:
 
 
 def decided_again(run: Run, log: Log, names: Sequence[Any], free: bool = True) -> Reassociated:
-    given = given_by(run)
+    given = batch_input(run)
     given = replace(given, associations=replace(given.associations, landmark=names))
-    return reassociated(BatchReplay.of(given, log), np.full(len(names), free))
+    return reassociate(BatchReplay.of(given, log), np.full(len(names), free))
 
 
 def parts(names: Sequence[Any]) -> set[frozenset[int]]:
@@ -50,7 +50,7 @@ def shared(found: Sequence[Any], right: Sequence[Any]) -> float:
 
 def test_a_right_association_stays(known: tuple[Run, Log]) -> None:
     run, log = known
-    names = list(given_by(run).associations.landmark)
+    names = list(batch_input(run).associations.landmark)
     found = decided_again(run, log, names)
     assert found.settled and not found.merged and not found.new
     assert {a for a, b in zip(found.landmark, names, strict=True) if a != b} <= {None}
@@ -61,15 +61,15 @@ def test_what_is_held_does_not_change_and_its_optimum_is_that_of_the_filters_ass
     known: tuple[Run, Log],
 ) -> None:
     run, log = known
-    names = list(given_by(run).associations.landmark)
+    names = list(batch_input(run).associations.landmark)
     found = decided_again(run, log, names, free=False)
     assert found.landmark == names and found.rounds == 1
-    np.testing.assert_allclose(found.batch.means, optimum(replayed(given_by(run), log)).means, atol=1e-7)
+    np.testing.assert_allclose(found.batch.means, optimum(replay_events(batch_input(run), log)).means, atol=1e-7)
 
 
 def test_a_doubled_a_split_a_lost_landmark_and_wrong_observations_are_found(known: tuple[Run, Log]) -> None:
     run, log = known
-    right = list(given_by(run).associations.landmark)
+    right = list(batch_input(run).associations.landmark)
     often = sorted({*right}, key=lambda name: (-right.count(name), name))
     doubled, lost = often[:2]
     places = dict(zip(run.landmarks.ids, run.landmarks.positions()[0], strict=True))
@@ -91,7 +91,7 @@ def test_a_doubled_a_split_a_lost_landmark_and_wrong_observations_are_found(know
     assert len(parts(found.landmark)) == len({*right})
     assert shared(found.landmark, right) > 0.97
     mine = dict(zip(found.batch.ids, found.batch.means, strict=True))
-    best = optimum(replayed(given_by(run), log))
+    best = optimum(replay_events(batch_input(run), log))
     for name, place in zip(best.ids, best.means, strict=True):
         other = found.new[0] if name == lost else found.merged.get(name, name)
         np.testing.assert_allclose(mine[other], place, atol=0.1)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 import kalmark as km
-from kalmark.batch.data import replayed
+from kalmark.batch.data import replay_events
 from kalmark.batch.wall_anchors import anchors
 from kalmark.config import build_slam
 from kalmark.geometry.spaces import SE2
 from kalmark.models.landmarks import Wall2D
-from kalmark.results.batch import compare, given_by, solve_batch
+from kalmark.results.batch import batch_input, compare_with_filter, solve_batch
 from kalmark.simulate import load_world, simulate
 
 WALLS = (
@@ -25,7 +25,7 @@ def test_the_batch_solution_of_walls_is_that_of_the_filter_and_fits_the_noise() 
     world = load_world("hall_of_walls", WALLS)
     log = simulate(world, 1)
     run = km.record(build_slam(world.config(), log), log, progress=False)
-    found = compare(run, solve_batch(run, log))
+    found = compare_with_filter(run, solve_batch(run, log))
     assert found["landmarks"] == 15
     assert 0.95 < found["sigma_ratio"] < 1.1
     assert found["map_difference_sigma"] < 0.2
@@ -36,12 +36,12 @@ def test_walls_and_corners_are_solved_for_together() -> None:
     world = load_world("hall_of_walls", ("steps=120",))
     log = simulate(world, 1)
     run = km.record(build_slam(world.config(), log), log, progress=False)
-    problem = replayed(given_by(run), log)
+    problem = replay_events(batch_input(run), log)
     held = ~problem.free[problem.start.columns(1, np.arange(len(problem.ids))) + 2]
     sizes = {name: len(run.final_slam().mean(name)) for name in problem.ids}
     assert {2, 3} == {*sizes.values()}
     assert held.tolist() == [sizes[name] == 2 for name in problem.ids]  # a point has no direction
-    assert 0.9 < compare(run, solve_batch(run, log))["chi2_per_dof"] < 1.1
+    assert 0.9 < compare_with_filter(run, solve_batch(run, log))["chi2_per_dof"] < 1.1
 
 
 def test_where_a_wall_is_anchored_has_its_derivatives() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from kalmark.campaign import run_campaign, running
 from kalmark.campaign.engine import Engine, refusal
-from kalmark.campaign.running import BATCHED, Plan, configs_of, grouped, path_of
+from kalmark.campaign.running import BATCHED, Plan, configs_of, group_tasks, path_of
 from kalmark.campaign.scoring import SERIES, Scores
 from kalmark.simulate import World, load_world
 
@@ -157,4 +157,4 @@ def test_runs_of_the_engine_are_done_many_at_once_and_those_of_the_ordinary_path
     fast = replace(plan, path=path_of(plan, running.WORTH))
     assert fast.path == BATCHED and path_of(plan, 1) == running.FEW
     tasks = [(cell, number) for cell in range(2) for number in range(3)]
-    assert grouped([plan, fast], tasks) == [(0, [0]), (0, [1]), (0, [2]), (1, [0, 1, 2])]
+    assert group_tasks([plan, fast], tasks) == [(0, [0]), (0, [1]), (0, [2]), (1, [0, 1, 2])]

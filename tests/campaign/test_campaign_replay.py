@@ -11,7 +11,7 @@ import pytest
 
 import kalmark as km
 from kalmark.campaign import Replay, open_scene, run_campaign
-from kalmark.campaign.replay import LEAST, Look, Steer, steered
+from kalmark.campaign.replay import LEAST, Look, Steer, steer_to_path
 from kalmark.campaign.scoring import SERIES
 from kalmark.cli import main
 from kalmark.cli.logs import fitting_config
@@ -198,14 +198,14 @@ def test_a_car_beside_its_path_comes_back_to_it() -> None:
         for k in range(1, 201):
             goal = np.array([0.1 * speed * k, 0.0, 0.0])
             steer = Steer(km.Control(t_s=0, robot="car", u=u), 0.1, goal, 25 * LEAST)
-            r, *_ = car.move(r, steered(car, r, steer, car.control_noise(u)), 0.1)
+            r, *_ = car.move(r, steer_to_path(car, r, steer, car.control_noise(u)), 0.1)
         assert np.abs(r - goal).max() < 0.05
 
 
 def test_without_noise_the_control_is_the_logs() -> None:
     still = km.motion.Unicycle(sigma_v_mps=0.0, sigma_w_radps=0.0)
     steer = Steer(km.Control(t_s=0, robot="r", u=(0.5, 0.1)), 0.1, np.array([1.0, 1.0, 0.0]))
-    assert steered(still, np.zeros(3), steer, still.control_noise(steer.event.u)) is steer.event.u
+    assert steer_to_path(still, np.zeros(3), steer, still.control_noise(steer.event.u)) is steer.event.u
 
 
 def test_the_command_line_replays_a_configuration_and_saves_it_to_be_run(tmp_path: Path, capsys: Any) -> None:

@@ -43,7 +43,7 @@ def test_a_point_whose_depth_is_not_known_yet_is_not_judged() -> None:
     l = np.array([0, 0, 0, 1.0, 0, 0, 0.2])  # five metres ahead
     for sigma, known in ((0.01, True), (0.1, False)):
         P = np.diag([0, 0, 0, 0, 0, 0, sigma**2])
-        judged = scoring.landmark(Ray(), l, P, np.array([5.5, 0, 0]), np.zeros(3), "world", np.zeros(3))
+        judged = scoring.judge_landmark(Ray(), l, P, np.array([5.5, 0, 0]), np.zeros(3), "world", np.zeros(3))
         assert (judged is not None) == known
         if judged is not None:
             np.testing.assert_allclose(judged.own, [0.5, 0, 0])
@@ -66,13 +66,13 @@ def test_a_line_is_judged_across_itself_where_its_ends_are() -> None:
 
     l, P, eye = np.array([1.0, 0, 0, 2, 0, 0]), 1e-4 * np.eye(6), np.array([0.0, 2.0, 0.0])  # along x
     truth = np.array([-3.0, 0.1, 0.2, 4.0, 0.1, -0.2])
-    judged = scoring.landmark(Line(), l, P, truth, np.zeros(3), "log", eye)
+    judged = scoring.judge_landmark(Line(), l, P, truth, np.zeros(3), "log", eye)
     assert judged is not None and judged.own.shape == (4,) and judged.F.shape == (4, 6)
     np.testing.assert_allclose(np.linalg.norm(judged.own.reshape(2, 2), axis=1), [math.hypot(0.1, 0.2)] * 2)
     np.testing.assert_allclose(judged.truth - judged.place, [[0, 0.1, 0.2], [0, 0.1, -0.2]], atol=1e-12)
-    assert scoring.landmark(Line(), l, 0.1 * np.eye(6), truth, np.zeros(3), "log", eye) is None
+    assert scoring.judge_landmark(Line(), l, 0.1 * np.eye(6), truth, np.zeros(3), "log", eye) is None
     d = np.array([0.0, 0.01, -0.02, 0.0, 0.03, 0.01])
-    moved = scoring.landmark(Line(), l + d, P, truth, np.zeros(3), "log", eye)
+    moved = scoring.judge_landmark(Line(), l + d, P, truth, np.zeros(3), "log", eye)
     assert moved is not None
     lengths = [
         np.linalg.norm((judged.own - judged.F @ d).reshape(2, 2), axis=1),

@@ -19,7 +19,7 @@ from pyarrow.parquet import read_table
 from kalmark.campaign import Sweep, open_cells, run_campaign, run_sweep
 from kalmark.campaign.finished_runs import Kept
 from kalmark.campaign.running import Plan
-from kalmark.campaign.sweep import over_runs, run_figures
+from kalmark.campaign.sweep import figure_over_runs, run_figures
 from kalmark.cli import main
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.simulate import load_world
@@ -81,10 +81,10 @@ def test_the_interval_of_an_rmse_covers_the_true_value_as_often_as_it_says() -> 
     truth, inside = np.sqrt(1.0 / 2.0 + 1.0), 0
     for _ in range(400):
         runs = np.sqrt(rng.exponential(1.0, 200) * 0.5 + 1.0)
-        value, half = over_runs("position_rmse_m", runs)
+        value, half = figure_over_runs("position_rmse_m", runs)
         inside += abs(value - truth) < half
     assert 0.91 < inside / 400 < 0.98
-    assert over_runs("pose_nees", np.array([2.0, np.nan, 4.0]))[0] == 3.0
+    assert figure_over_runs("pose_nees", np.array([2.0, np.nan, 4.0]))[0] == 3.0
 
 
 def test_the_figures_of_one_run_leave_out_the_first_steps(sweep: Sweep) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from kalmark.campaign import open_scene, run_campaign
-from kalmark.campaign.running import Plan, configs_of, died, results_of
+from kalmark.campaign.running import Plan, configs_of, results_of, worker_died
 from kalmark.errors import KalmarkError
 
 WORLD = """\
@@ -90,7 +90,7 @@ def test_workers_that_always_die_end_the_campaign_with_one_line(tmp_path: Path) 
 
 
 def test_an_error_of_a_run_itself_is_no_death_of_a_worker() -> None:
-    assert not died(ValueError("a mistake in a model"))
+    assert not worker_died(ValueError("a mistake in a model"))
     wrapped = RuntimeError("a task failed")
     wrapped.__cause__ = type("RayActorError", (Exception,), {})()
-    assert died(wrapped)
+    assert worker_died(wrapped)

@@ -26,7 +26,7 @@ from ros_bags import (
     field,
     fix,
     geodetic,
-    header,
+    header_fields,
     imu,
     odometry,
     pose,
@@ -82,7 +82,7 @@ def test_gaps_are_those_longer_than_five_usual_intervals(tmp_path: Path) -> None
 
 def test_what_kalmark_cannot_read_is_listed_and_not_used(tmp_path: Path) -> None:
     messages = [odometry(T0 + t, pose(t, 0, 0)) for t in range(3)]
-    unmeasured = {"header": header(T0, "imu"), "angular_velocity_covariance": np.full(9, -1.0)}
+    unmeasured = {"header": header_fields(T0, "imu"), "angular_velocity_covariance": np.full(9, -1.0)}
     messages += [Outgoing("/imu/data", "sensor_msgs/msg/Imu", T0, unmeasured)]
     messages += [Outgoing("/other", "some_msgs/msg/Other", T0, {})]
     text = config_of(tmp_path, messages)
@@ -174,7 +174,7 @@ def test_a_clock_of_a_simulator_beside_messages_without_header_gives_way_to_the_
     twist = {"linear": {"x": 1.0}, "angular": {"z": 0.1}}
     messages = [Outgoing("/cmd_vel", "geometry_msgs/msg/Twist", T0 + t, twist) for t in range(3)]
     located: dict[str, Any] = {
-        "header": header(10**9, "map"),
+        "header": header_fields(10**9, "map"),
         "pose": {"pose": pose(1, 2, 0), "covariance": np.eye(6).ravel()},
     }
     messages.append(Outgoing("/amcl_pose", "geometry_msgs/msg/PoseWithCovarianceStamped", T0 + 5, located))
@@ -184,10 +184,10 @@ def test_a_clock_of_a_simulator_beside_messages_without_header_gives_way_to_the_
 
 
 def test_the_numbers_of_a_camera_are_those_of_its_info(tmp_path: Path) -> None:
-    info = {"header": header(T0, "camera"), "width": 800, "height": 600, "distortion_model": "plumb_bob"}
+    info = {"header": header_fields(T0, "camera"), "width": 800, "height": 600, "distortion_model": "plumb_bob"}
     info |= {"k": [500.0, 0, 400, 0, 510, 300, 0, 0, 1], "d": [0.1, 0.01, 0, 0, 0]}
     corners = [{"x": float(x), "y": float(y)} for x, y in ((10, 20), (30, 20), (30, 40), (10, 40))]
-    tags = {"header": header(T0, "camera"), "detections": [{"id": 3, "corners": corners}]}
+    tags = {"header": header_fields(T0, "camera"), "detections": [{"id": 3, "corners": corners}]}
     text = config_of(tmp_path, [
         Outgoing("/camera_info", "sensor_msgs/msg/CameraInfo", T0, info),
         Outgoing("/tags", "apriltag_msgs/msg/AprilTagDetectionArray", T0, tags),
@@ -215,8 +215,16 @@ def test_the_numbers_of_a_camera_are_those_of_its_info(tmp_path: Path) -> None:
 def test_the_numbers_of_a_camera_that_kalmark_does_not_have_are_to_be_given(
     info: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
-    given = {"header": header(T0, "camera"), "width": 800, "height": 600, "k": [500.0, 0, 400, 0, 510, 300, 0, 0, 1]}
-    boxes = {"header": header(T0, "camera"), "detections": [{"bbox": {"center": {"position": {"x": 9.0, "y": 9.0}}}}]}
+    given = {
+        "header": header_fields(T0, "camera"),
+        "width": 800,
+        "height": 600,
+        "k": [500.0, 0, 400, 0, 510, 300, 0, 0, 1],
+    }
+    boxes = {
+        "header": header_fields(T0, "camera"),
+        "detections": [{"bbox": {"center": {"position": {"x": 9.0, "y": 9.0}}}}],
+    }
     text = config_of(tmp_path, [
         Outgoing("/camera_info", "sensor_msgs/msg/CameraInfo", T0, given | info),
         Outgoing("/boxes", "vision_msgs/msg/Detection2DArray", T0, boxes),
@@ -225,7 +233,7 @@ def test_the_numbers_of_a_camera_that_kalmark_does_not_have_are_to_be_given(
 
 
 def test_images_are_counted_and_the_configuration_says_what_to_do_with_them(kalmark: Kalmark, tmp_path: Path) -> None:
-    image = Outgoing("/camera/image_raw", "sensor_msgs/msg/Image", T0, {"header": header(T0, "camera")})
+    image = Outgoing("/camera/image_raw", "sensor_msgs/msg/Image", T0, {"header": header_fields(T0, "camera")})
     text = config_of(tmp_path, [image, odometry(T0, pose(0, 0, 0)), odometry(T0 + 9, pose(1, 0, 0))])
     assert "# not used: /camera/image_raw (sensor_msgs/Image): images: `{type: images}` gives them to" in text
     assert "images" in kalmark("bag", tmp_path / "mcap").out
@@ -238,7 +246,7 @@ def test_an_odometry_whose_poses_stand_still_is_taken_for_its_velocities(tmp_pat
 
 
 def test_velocities_and_satellite_fixes_start_with_an_unknown_heading(tmp_path: Path) -> None:
-    twist = {"header": header(T0, "base_link"), "twist": {"linear": {"x": 1.0}}}
+    twist = {"header": header_fields(T0, "base_link"), "twist": {"linear": {"x": 1.0}}}
     messages = [Outgoing("/twist", "geometry_msgs/msg/TwistStamped", T0, twist)]
     messages += [fix(T0 + t * 10**9, geodetic([float(t), 0.0, 0.0])) for t in range(5)]
     assert "theta_rad: 0, sigma_xy_m: 5, sigma_theta_rad: 1.5}  # GUESS" in config_of(tmp_path, messages)
@@ -246,7 +254,7 @@ def test_velocities_and_satellite_fixes_start_with_an_unknown_heading(tmp_path: 
 
 @pytest.mark.parametrize("space", [False, True])
 def test_a_robot_without_controls_goes_on_as_it_goes(space: bool, tmp_path: Path) -> None:
-    beams = {"header": header(T0, "laser"), "angle_increment": 0.1, "range_max": 9.0, "ranges": [1.0, 2.0]}
+    beams = {"header": header_fields(T0, "laser"), "angle_increment": 0.1, "range_max": 9.0, "ranges": [1.0, 2.0]}
     if space:
         messages = [fix(T0 + t * 10**9, geodetic([0.0, 0.0, 0.0])) for t in range(3)]
     else:
@@ -259,7 +267,7 @@ def test_a_robot_without_controls_goes_on_as_it_goes(space: bool, tmp_path: Path
 def markers(frame: str, w: float = 1.0, topic: str = "/markers") -> Outgoing:
     """Return two markers, of which one has the place of the other; w of 0 leaves their rotations away."""
     listed = [
-        {"id": k, "header": header(T0, frame), "pose": {"position": {"x": 1.0 + k}, "orientation": {"w": w}}}
+        {"id": k, "header": header_fields(T0, frame), "pose": {"position": {"x": 1.0 + k}, "orientation": {"w": w}}}
         for k in range(2)
     ]
     return Outgoing(topic, "visualization_msgs/msg/MarkerArray", T0, {"markers": listed})
@@ -288,7 +296,7 @@ def test_an_inertial_unit_moves_a_robot_of_space_without_other_controls(tmp_path
     for event in log.events:
         slam.process(event)
     assert np.linalg.norm(slam.mean("robot")[:3]) < 0.1
-    beams = {"header": header(T0, "laser"), "angle_increment": 0.1, "range_max": 9.0, "ranges": [1.0, 2.0]}
+    beams = {"header": header_fields(T0, "laser"), "angle_increment": 0.1, "range_max": 9.0, "ranges": [1.0, 2.0]}
     (tmp_path / "flat").mkdir()
     assert "type: inertial" not in config_of(
         tmp_path / "flat", [*units, Outgoing("/scan", "sensor_msgs/msg/LaserScan", T0, beams)]
@@ -300,7 +308,7 @@ def test_fixes_say_where_a_robot_starts_unless_the_truth_is_in_their_frame(frame
     messages = [odometry(T0 + t * 10**9, pose(t, 0, 0)) for t in range(5)]
     for k, (topic, kind, x) in enumerate((("/amcl", "PoseWithCovarianceStamped", 3.0), ("/vicon", "PoseStamped", 7.0))):
         at = {"pose": pose(x, 0, 0), "covariance": np.eye(6).ravel()} if k == 0 else pose(x, 0, 0)
-        fields = {"header": header(T0, "odom" if k == 0 else frame), "pose": at}
+        fields = {"header": header_fields(T0, "odom" if k == 0 else frame), "pose": at}
         messages.append(Outgoing(topic, f"geometry_msgs/msg/{kind}", T0, fields))
     text = config_of(tmp_path, messages)
     assert "/vicon: {type: truth}" in text and ("start: {x_m: 3" in text) == (frame == "vicon")
@@ -386,7 +394,7 @@ def test_robots_whose_odometry_is_in_tf_alone_have_their_names_there(tmp_path: P
 def test_a_time_of_0_in_headers_is_none(kind: str, tmp_path: Path) -> None:
     messages = [odometry(T0 + t * 10**9, pose(t, 0, 0)) for t in range(4)]
     for message in messages if kind == "all" else messages[:1]:
-        message.fields["header"] = header(0, "odom")
+        message.fields["header"] = header_fields(0, "odom")
     text = config_of(tmp_path, messages)
     assert ("time: recorded" in text) == (kind == "all")
     log = open_run(tmp_path / "config.yaml")[1]
@@ -401,7 +409,7 @@ def test_a_clock_that_was_set_back_gives_way_to_the_recorder(back_ns: int, wante
     messages = [odometry(T0 + t * 10**9, pose(t, 0, 0)) for t in range(6)]
     late = messages[3:] if back_ns > 1 else messages[3:4]
     for message in late:
-        message.fields["header"] = header(message.t_ns - back_ns - (10**9 if back_ns == 1 else 0), "odom")
+        message.fields["header"] = header_fields(message.t_ns - back_ns - (10**9 if back_ns == 1 else 0), "odom")
     text = config_of(tmp_path, messages)
     assert wanted in text and ("runs back by 3.6e+03 s" in text or "run back by 1e-09 s" in text)
     controls = open_run(tmp_path / "config.yaml")[1].events
@@ -409,7 +417,7 @@ def test_a_clock_that_was_set_back_gives_way_to_the_recorder(back_ns: int, wante
 
 
 def test_positions_without_a_covariance_get_a_guess(tmp_path: Path) -> None:
-    bare = {"header": header(T0, "map"), "pose": {"pose": pose(0, 0, 0)}}
+    bare = {"header": header_fields(T0, "map"), "pose": {"pose": pose(0, 0, 0)}}
     messages = [odometry(T0, pose(0, 0, 0)), odometry(T0 + 1, pose(1, 0, 0)), fix(T0, [48.0, 11.0, 0.0], sigma=0.0),
                 Outgoing("/pose", "geometry_msgs/msg/PoseWithCovarianceStamped", T0, bare)]  # fmt: skip
     text = config_of(tmp_path, messages)
@@ -418,13 +426,13 @@ def test_positions_without_a_covariance_get_a_guess(tmp_path: Path) -> None:
 
 
 def test_poses_that_a_robot_is_to_have_are_not_its_odometry(tmp_path: Path) -> None:
-    goals = [Outgoing("/goal_pose", "geometry_msgs/msg/PoseStamped", T0 + t, {"header": header(T0 + t, "map"),
+    goals = [Outgoing("/goal_pose", "geometry_msgs/msg/PoseStamped", T0 + t, {"header": header_fields(T0 + t, "map"),
              "pose": pose(t, 0, 0)}) for t in range(20)]  # fmt: skip
     assert "# not used: /goal_pose" in config_of(tmp_path, [*goals, fix(T0, [48.0, 11.0, 0.0])])
 
 
 def test_a_car_s_wheelbase_is_to_be_looked_at(tmp_path: Path) -> None:
-    car = Outgoing("/drive", "ackermann_msgs/msg/AckermannDriveStamped", T0, {"header": header(T0, "base_link")})
+    car = Outgoing("/drive", "ackermann_msgs/msg/AckermannDriveStamped", T0, {"header": header_fields(T0, "base_link")})
     text = config_of(tmp_path, [car])
     assert "motion: {type: ackermann, wheelbase_m: 2.83, encoder_offset_m: 0}  # GUESS: its wheelbase" in text
 

@@ -13,7 +13,7 @@ from command_line import Kalmark, write_log
 from kalmark.bags.mcap_writer import Types
 from kalmark.bags.run_messages import export
 from kalmark.config import build_slam, open_run
-from kalmark.events import Control, Fix, Scan, order
+from kalmark.events import Control, Fix, Scan, sort_key
 from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
 from kalmark.results.record import record
 from kalmark.results.run import Run
@@ -117,7 +117,7 @@ def test_increments_that_scans_cut_are_written_whole(
         "control_columns": {"cart": ("dx_m", "dy_m", "dtheta_rad")},
         "sensor_columns": {("cart", "eye"): ("x_m", "y_m")},
     }
-    write_native(Log("cart", ("cart",), sorted([*events, *seen], key=order), **columns), tmp_path / "log")
+    write_native(Log("cart", ("cart",), sorted([*events, *seen], key=sort_key), **columns), tmp_path / "log")
     robot = "{motion: {type: odometry_2d}, sensors: {eye: {type: position}}}"
     (tmp_path / "cart.yaml").write_text(f"log: {{path: log}}\nrobots: {{cart: {robot}}}\n")
     assert len(open_run(tmp_path / "cart.yaml")[1].events) > 9

@@ -9,12 +9,12 @@ import pytest
 
 from command_line import Kalmark, write_log, write_log_of_space
 from kalmark.config import build_slam, open_run
-from kalmark.logs.poses import in_space, read_path
-from kalmark.logs.source import Request, raising
+from kalmark.logs.poses import poses_in_space, read_path
+from kalmark.logs.source import Request, raise_refusal
 from kalmark.results.record import record
 from kalmark.results.run import Run
 
-REQUEST = Request(None, raising, [])
+REQUEST = Request(None, raise_refusal, [])
 OWN = (
     "log: {path: log}\nrobots: {each: {sensors: {lidar: {type: range_bearing, mount: {x_m: 0.1, theta_rad: 0.2}}}}}\n",
     "log: {path: log}\nrobots: {each: {motion: {type: odometry_3d}, sensors: {lidar: {type: range_bearing_3d, "
@@ -33,7 +33,7 @@ def test_a_run_s_path_is_written_and_scored_by_files_of_poses(kalmark: Kalmark, 
         assert kalmark("convert", "run", name).status == 0
         found = read_path(tmp_path / name, REQUEST)
         history = Run.load(tmp_path / "run").history
-        np.testing.assert_allclose(found.poses[:, :3], in_space(history.poses)[:, :3], atol=1e-8)
+        np.testing.assert_allclose(found.poses[:, :3], poses_in_space(history.poses)[:, :3], atol=1e-8)
     assert (tmp_path / "path.tum").read_text() == (tmp_path / "run" / "trajectory_rover.tum").read_text()
     scored = kalmark("evaluate", "run", "--truth", "path.tum")
     assert scored.status == 0 and "0.000" in scored.out

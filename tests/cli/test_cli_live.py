@@ -22,7 +22,7 @@ import pytest
 import kalmark as km
 from command_line import Kalmark
 from kalmark.cli.live import Checkpoints, Signals, serve
-from kalmark.logs.json_lines import KEYS, LONGEST_LINE, event_of, line_of, mapping_of
+from kalmark.logs.json_lines import KEYS, LONGEST_LINE, event_of_object, line_of_event, mapping_of
 from kalmark.results.live import Incoming, Live, converse
 
 CONFIG = """robots:
@@ -72,7 +72,7 @@ def test_the_answers_are_those_of_the_loop_in_python(tmp_path: Path) -> None:
         cov = None if k % 2 else np.diag([0.01, 0.001])
         events.append(km.Scan(t_ns=t_ns + 1, robot="rover", sensor="lidar", y=y, ids=[1, "b", 2**70], cov=cov))
     events.append(km.Fix(t_ns=t_ns + 2, robot="rover", y=[1, 2], cov=np.eye(2)))
-    answers = talk(live, *map(line_of, events))
+    answers = talk(live, *map(line_of_event, events))
     for event in events:
         other.process(event)
     names = ["rover", 1, "b", 2**70]
@@ -302,7 +302,10 @@ def test_signals_end_it_between_events_and_the_map_is_saved(
 
 def test_events_come_back_from_their_lines() -> None:
     for given in (CONTROL, SCAN, FIX):
-        event = event_of(mapping_of(json.dumps(given)))
-        assert line_of(event_of(mapping_of(line_of(event)))) == line_of(event) and type(event) is KEYS[given["type"]][0]
+        event = event_of_object(mapping_of(json.dumps(given)))
+        assert (
+            line_of_event(event_of_object(mapping_of(line_of_event(event)))) == line_of_event(event)
+            and type(event) is KEYS[given["type"]][0]
+        )
     with pytest.raises(km.errors.EventError, match="a frame is not written as a line"):
-        line_of(km.Frame(t_s=1.0, robot="a", sensor="b", image=np.zeros((2, 2), np.uint8)))
+        line_of_event(km.Frame(t_s=1.0, robot="a", sensor="b", image=np.zeros((2, 2), np.uint8)))

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.bags.mcap_writer import Outgoing, header
-from kalmark.datasets.images.tum import published
+from kalmark.bags.mcap_writer import Outgoing, header_fields
+from kalmark.datasets.images.tum import published_calibration
 from kalmark.errors import ConfigError, EventError, LogError
 from kalmark.events import Control, Frame
 from kalmark.logs import Log, write_native
@@ -188,8 +188,8 @@ def test_tum_rgbd_has_each_depth_at_the_nearest_image(tmp_path: Path) -> None:
     assert log.truth["robot"].at(10_050_000_000)[0] == pytest.approx(1.05)
     assert camera(log)["fx_px"] == pytest.approx(517.306 / 10)
     assert camera(log)["cx_px"] == pytest.approx((318.643 + 0.5) / 10 - 0.5)
-    assert published("something_else") == {}
-    assert published("fr3_office")["fx_px"] == 535.4
+    assert published_calibration("something_else") == {}
+    assert published_calibration("fr3_office")["fx_px"] == 535.4
 
 
 def test_kitti_odometry_has_the_left_camera_and_its_poses(tmp_path: Path) -> None:
@@ -278,20 +278,20 @@ def test_images_of_a_bag_are_read_when_they_are_needed(tmp_path: Path, kind: str
     messages = []
     for k in range(4):
         t = T0 + k * 10**8
-        image = {"header": header(t, "camera"), "height": 48, "width": 64, "encoding": "mono8", "is_bigendian": 0,
-                 "step": 70, "data": np.pad(picture(k), ((0, 0), (0, 6))).ravel()}  # fmt: skip
+        image = {"header": header_fields(t, "camera"), "height": 48, "width": 64, "encoding": "mono8",
+                 "is_bigendian": 0, "step": 70, "data": np.pad(picture(k), ((0, 0), (0, 6))).ravel()}  # fmt: skip
         if k == 2:
             image |= {"encoding": "rgb8", "step": 192, "data": colour.ravel()}
         if k == 3:
             image |= {"encoding": "yuv422"}
         messages.append(Outgoing("/cam/image_raw", "sensor_msgs/msg/Image", t, image))
         packed = cv2.imencode(".png", picture(k))[1].ravel()
-        small = {"header": header(t, "camera"), "format": "png", "data": packed}
+        small = {"header": header_fields(t, "camera"), "format": "png", "data": packed}
         messages.append(Outgoing("/right/compressed", "sensor_msgs/msg/CompressedImage", t, small))
     matrix = {"k": [60.0, 0, 32, 0, 61, 24, 0, 0, 1], "d": [0.1, 0, 0, 0, 0], "distortion_model": "plumb_bob"}
     if kind == "ros1.bag":
         matrix = {"K": matrix["k"], "D": matrix["d"], "distortion_model": "plumb_bob"}
-    info = {"header": header(T0, "camera"), "width": 64, "height": 48} | matrix
+    info = {"header": header_fields(T0, "camera"), "width": 64, "height": 48} | matrix
     bag = write_bag(tmp_path, kind, [Outgoing("/cam/camera_info", "sensor_msgs/msg/CameraInfo", T0, info), *messages])
     topics = {"/cam/image_raw": {"type": "images", "sensor": "left"}, "/right/compressed": {"type": "images"}}
     log = km.open_log(bag, topics=topics)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Scan, order
+from kalmark.events import Control, Scan, sort_key
 from kalmark.logs import Log, open_log, write_native
 
 Data = Callable[[str], Path]
@@ -76,7 +76,7 @@ def test_mrclam_robots_that_sight_each_other_are_named(data: Data) -> None:
     seen = sightings(log, "robot4")
     assert seen["robot1"] > 0 and not {"robot2", "robot3", "robot5"} & set(seen)
     assert log.robots == ("robot1", "robot4")
-    assert [order(event) for event in log] == sorted(order(event) for event in log)
+    assert [sort_key(event) for event in log] == sorted(sort_key(event) for event in log)
     alone = opened(data("mrclam/MRCLAM_Dataset9"), robots=5, robot_sightings=False)
     assert all(isinstance(id_, int) for id_ in sightings(alone))
     assert any("robot_sightings is false" in line for line in alone.skipped)

@@ -11,7 +11,7 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis import doubled_landmarks
-from kalmark.diagnosis.gross_mistakes import fit
+from kalmark.diagnosis.gross_mistakes import fit_of_run
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log, Trajectory
 from kalmark.results.evaluate import evaluate
@@ -137,8 +137,8 @@ def test_things_in_a_map_twice_are_not_seen_again_where_they_were() -> None:
     half = log.events[len(log.events) // 2].t_ns
     doubled = with_scans(lambda e: e if e.t_ns < half else scan_of(e, ids=[1000 + int(str(i)) for i in e.ids or ()]))
     clean, twice = run_of(log), run_of(replace(log, events=[*map(doubled, log.events)]))
-    assert doubled_landmarks.unseen(clean) is None
-    found = doubled_landmarks.unseen(twice)
+    assert doubled_landmarks.unseen_counts(clean) is None
+    found = doubled_landmarks.unseen_counts(twice)
     assert found is not None and found.since_s > half * 1e-9 - 1.0
     verdict = km.diagnose(twice)
     assert verdict.map == "doubtful" and "unseen_landmarks" in [cause.name for cause in verdict.causes]
@@ -149,8 +149,8 @@ def test_what_a_budget_leaves_out_is_no_misfit() -> None:
     run = run_of(log)
     outcome, reason = run.history.outcome.copy(), run.history.reason.astype("U40")
     outcome[::2], reason[::2] = "ignored", "not among the 10 of most information"
-    assert fit(replace(run, history=replace(run.history, outcome=outcome, reason=reason))).mean < 2.0
-    assert fit(replace(run, history=replace(run.history, outcome=outcome))).mean > 10.0
+    assert fit_of_run(replace(run, history=replace(run.history, outcome=outcome, reason=reason))).mean < 2.0
+    assert fit_of_run(replace(run, history=replace(run.history, outcome=outcome))).mean > 10.0
 
 
 def test_warnings_by_the_truth_leave_an_ok() -> None:

@@ -15,25 +15,25 @@ from hall import hall, mapped
 
 import kalmark as km
 from kalmark.batch.batch_state import LANDMARKS
-from kalmark.batch.data import replayed
+from kalmark.batch.data import replay_events
 from kalmark.batch.solver import optimum
 from kalmark.cli.app import main
 from kalmark.cli.run import run_log
 from kalmark.config import build_slam, config_dict
-from kalmark.diagnosis.batch_search import SEGMENT, thinned
+from kalmark.diagnosis.batch_search import SEGMENT, subsample
 from kalmark.diagnosis.breakdown import breakdown, nees_parts
-from kalmark.diagnosis.cause_texts import words
+from kalmark.diagnosis.cause_texts import finding_text
 from kalmark.diagnosis.causes import Finding
-from kalmark.diagnosis.gross_mistakes import elsewhere, fit
+from kalmark.diagnosis.gross_mistakes import displaced_landmarks, fit_of_run
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.repeated_events import copied
+from kalmark.diagnosis.repeated_events import repeated_measurements
 from kalmark.diagnosis.verdict import Verdict, causes_of
-from kalmark.events import Control, Event, Scan, order
+from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import SE3
 from kalmark.logs import write_native
 from kalmark.logs.log import Log
-from kalmark.results.batch import given_by
+from kalmark.results.batch import batch_input
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.verdict_text import verdict_lines
@@ -151,7 +151,7 @@ def test_a_log_that_does_not_fit_is_not_ok_where_there_is_no_batch_solution(monk
     def unsolved(*given: Any) -> Any:
         raise km.KalmarkError("not determined")
 
-    monkeypatch.setattr("kalmark.diagnosis.verdict.searched", unsolved)
+    monkeypatch.setattr("kalmark.diagnosis.verdict.search_causes", unsolved)
     assert km.diagnose(run_of()).map == "ok"
     verdict = km.diagnose(run_of(measuring(lambda y: np.add(y, [0.0, 0.5 * np.sin(3 * y[0, 0])]))))
     assert (verdict.map, verdict.causes[0].name) == ("doubtful", "misfit")
@@ -362,7 +362,7 @@ def with_fixes(log: Log) -> Log:
         for d in (2 if truth.poses.shape[1] == 3 else 3,)
         for t, pose in [*zip(truth.t_ns, truth.poses, strict=True)][::10]
     ]
-    return replace(log, events=sorted([*log.events, *fixes], key=order))
+    return replace(log, events=sorted([*log.events, *fixes], key=sort_key))
 
 
 @pytest.mark.parametrize("heading", [0.5, 1.0, -2.5])
@@ -525,7 +525,7 @@ def test_errors_that_last_under_a_noise_that_is_stated_too_large_are_no_systemat
         return seen(e, y=e.y + np.array([last[i] for i in e.ids]), t_ns=e.t_ns + 100_000_000)
 
     wide = (f"{SIGMA}=0.4", "robots.rover.sensors.lidar.sigma_bearing_rad=0.08")
-    log = replace(log, events=sorted(map(lasting, log.events), key=order))
+    log = replace(log, events=sorted(map(lasting, log.events), key=sort_key))
     verdict = km.diagnose(recorded(log, *wide))
     assert verdict.search is not None
     found = {f.name: f for f in verdict.search.found}
@@ -557,7 +557,7 @@ def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidn
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=2.0)
     assert f"what is called {a} is where {b} was" in verdict.causes[0].evidence
     # its score is half of the chi-square of what was filtered again, which is at most that of the whole run
-    assert 100 < verdict.causes[0].score < 0.5 * fit(run).chi2
+    assert 100 < verdict.causes[0].score < 0.5 * fit_of_run(run).chi2
 
 
 def test_wrong_ids_that_pull_the_solution_far_are_named_alone_and_the_map_is_not_ok() -> None:
@@ -590,9 +590,9 @@ def test_places_that_are_exchanged_are_found_under_a_shift_and_a_turn() -> None:
     before = dict(enumerate(rng.uniform(0, 20, (12, 2))))
     c, s = np.cos(2.0), np.sin(2.0)
     after = {k: np.array([[c, -s], [s, c]]) @ p + [3.0, -7.0] + rng.normal(size=2) * 0.02 for k, p in before.items()}
-    assert elsewhere(before, after) == {}
-    assert elsewhere(before, after | {2: after[5], 5: after[2]}) == {2: 5, 5: 2}
-    assert elsewhere(before, after | {2: after[2] + 2.0}) == {}
+    assert displaced_landmarks(before, after) == {}
+    assert displaced_landmarks(before, after | {2: after[5], 5: after[2]}) == {2: 5, 5: 2}
+    assert displaced_landmarks(before, after | {2: after[2] + 2.0}) == {}
 
 
 def test_a_landmark_that_moves_by_less_than_the_map_is_good_to_is_no_cause() -> None:
@@ -609,7 +609,7 @@ def test_what_is_left_of_data_is_their_projection_in_textbook_form() -> None:
     run = run_of(settings=("steps=12",))
     log = Log("", ("rover",), simulate(world_of("steps=12"), 3).events)
     run = km.record(build_slam(world_of().config(), log), log, progress=False)
-    problem = replayed(given_by(run), log)
+    problem = replay_events(batch_input(run), log)
     linear = Linear.of(problem, optimum(problem).state)
     rng, n, q = np.random.default_rng(1), len(linear.at.z), len(linear.at.w)
     z, e = rng.normal(size=n), rng.normal(size=linear.root.shape[1])
@@ -629,8 +629,8 @@ def test_systematic_errors_of_controls_match_differences() -> None:
     log = simulate(world_of("steps=12"), 3)
     config = world_of().config()
     run = km.record(build_slam(config, log), log, progress=False)
-    given = given_by(run)
-    problem, h = replayed(given, log), 1e-6
+    given = batch_input(run)
+    problem, h = replay_events(given, log), 1e-6
     for k, error in enumerate(problem.motions.errors):
         c = ("v_mps", "w_radps").index(error.column)
         way = {"offset": lambda u: 1.0, "scale": lambda u, c=c: u[c], "per_way": lambda u: abs(u[0])}[error.kind]
@@ -640,7 +640,7 @@ def test_systematic_errors_of_controls_match_differences() -> None:
             u[c] += h * way(u)
             return u
 
-        other = replayed(given, map(controlling(more), log.events))
+        other = replay_events(given, map(controlling(more), log.events))
         w, _ = problem.motions.term.at(problem.start)
         w_more, _ = other.motions.term.at(problem.start)
         np.testing.assert_allclose((w - w_more).ravel() / h, problem.motions.systematic[:, k], atol=1e-5)
@@ -731,7 +731,7 @@ def test_a_hall_that_is_mapped_twice_after_a_gap_is_wrong_and_its_wheel_is_named
 def test_scans_that_come_twice_are_named_and_count_once() -> None:
     log = simulate(world_of("steps=200"), 3)
     again = [seen(e, t_ns=e.t_ns + 1_000_000) for e in log.events if isinstance(e, Scan)]
-    log = replace(log, events=sorted([*log.events, *again], key=order))
+    log = replace(log, events=sorted([*log.events, *again], key=sort_key))
     verdict = km.diagnose(recorded(log))
     assert [cause.name for cause in verdict.causes] == ["copies"]
     number, _, of, *_ = verdict.causes[0].evidence.split()
@@ -744,7 +744,7 @@ def test_segments_of_a_long_log_have_scans_enough_of_each_robot() -> None:
     world = load_world("two_robots", ["steps=400"])
     log = simulate(world, 0)
     run = km.record(build_slam(world.config(), log), log, progress=False)
-    given = thinned(run, given_by(run), 600)
+    given = subsample(run, batch_input(run), 600)
     assert given.segments is not None and len(given.segments) > 1
     for begin, end in given.segments.tolist():
         robots = given.robot[(given.t_ns >= begin) & (given.t_ns <= end)]
@@ -753,7 +753,7 @@ def test_segments_of_a_long_log_have_scans_enough_of_each_robot() -> None:
 
 def test_copies_come_in_pairs_and_a_sensor_that_repeats_itself_for_long_has_none() -> None:
     def copies_in(values: list[float]) -> int:
-        return int(copied(np.array(values).reshape(-1, 1), np.arange(len(values))).sum())
+        return int(repeated_measurements(np.array(values).reshape(-1, 1), np.arange(len(values))).sum())
 
     noise = [float(k) for k in range(1, 21)]
     assert copies_in([a for value in noise for a in (value, value)]) == 20
@@ -763,11 +763,11 @@ def test_copies_come_in_pairs_and_a_sensor_that_repeats_itself_for_long_has_none
 def test_a_scan_is_a_copy_if_all_its_rows_are() -> None:
     first = np.arange(0, 80, 2)  # scans of two rows, the second of each pair a copy
     y = np.repeat(np.arange(80.0).reshape(20, 4), 2, axis=0).reshape(-1, 2)
-    assert copied(y, first).sum() == 20
+    assert repeated_measurements(y, first).sum() == 20
     y[7, 1] += 1e-12
-    assert copied(y, first).sum() == 19
+    assert repeated_measurements(y, first).sum() == 19
     with_more = np.delete(first, 1)  # one scan of four rows: the next is no copy of it
-    assert copied(y, with_more).sum() == 18
+    assert repeated_measurements(y, with_more).sum() == 18
 
 
 def test_noise_of_several_columns_is_no_outliers() -> None:
@@ -784,8 +784,8 @@ def test_noise_of_several_columns_is_no_outliers() -> None:
 def test_the_cure_of_a_control_noise_names_the_key_of_its_column() -> None:
     config = {"robots": {"a": {"motion": {"sigma_theta_rad": 0.01, "sigma_x_m": 0.02}}}}
     finding = Finding("control_sigma", ("a", "dtheta_rad"), 10.0, 0.0, 3.0, 0.1, "times")
-    assert words(finding, config)[1] == "--set robots.a.motion.sigma_theta_rad=0.03"
-    assert words(replace(finding, of=("a", "dx_m")), config)[1] == "--set robots.a.motion.sigma_x_m=0.06"
+    assert finding_text(finding, config)[1] == "--set robots.a.motion.sigma_theta_rad=0.03"
+    assert finding_text(replace(finding, of=("a", "dx_m")), config)[1] == "--set robots.a.motion.sigma_x_m=0.06"
 
 
 def test_a_map_of_tags_is_judged_by_its_batch_solution() -> None:

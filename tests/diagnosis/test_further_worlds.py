@@ -14,9 +14,9 @@ import kalmark as km
 from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import Verdict
-from kalmark.events import Control, Event, Scan, order
+from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.logs.log import Log
-from kalmark.logs.log_corrections import at_time
+from kalmark.logs.log_corrections import event_at_time
 from kalmark.simulate import load_world, simulate
 
 Plant = Callable[[Log], Log]
@@ -29,13 +29,13 @@ def scans(change: Callable[[Array], Array], robot: str = "", late_s: float = 0.0
         t_ns = e.t_ns + round(late_s * 1e9)
         return Scan(t_ns=t_ns, robot=e.robot, sensor=e.sensor, y=change(e.y.copy()), ids=e.ids)
 
-    return lambda log: replace(log, events=sorted(map(of, log.events), key=order))
+    return lambda log: replace(log, events=sorted(map(of, log.events), key=sort_key))
 
 
 def carried(log: Log) -> Log:
     """Leave out a fifth of the log: the robot is elsewhere when it comes again."""
     begin, end = (log.events[k * len(log.events) // 5].t_ns for k in (2, 3))
-    rest = [at_time(e, e.t_ns - end + begin) for e in log.events if e.t_ns >= end]
+    rest = [event_at_time(e, e.t_ns - end + begin) for e in log.events if e.t_ns >= end]
     return replace(log, events=[*(e for e in log.events if e.t_ns < begin), *rest])
 
 

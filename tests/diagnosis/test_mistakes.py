@@ -13,11 +13,11 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.config.tree import parse_value
-from kalmark.diagnosis.gross_mistakes import FITS, fit, gross
+from kalmark.diagnosis.gross_mistakes import FITS, fit_of_run, gross
 from kalmark.diagnosis.mistakes import Mistake
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log
-from kalmark.logs.log_corrections import corrected
+from kalmark.logs.log_corrections import correct_log
 from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 
@@ -67,7 +67,7 @@ def cured(log: Log, mistake: Mistake) -> Log:
         for name in names[:-1]:
             section = section.setdefault(name, {})
         section[names[-1]] = parse_value(value, "cure")
-    return corrected(log, **options)
+    return correct_log(log, **options)
 
 
 CASES: dict[str, tuple[Change, str, str]] = {
@@ -89,7 +89,7 @@ def test_a_mistake_is_named_and_its_cure_makes_the_log_fit(case: str) -> None:
     assert mistake is not None
     assert mistake.name == name
     assert re.search(told, mistake.evidence), mistake.evidence
-    assert fit(run_of(cured(log, mistake))).mean < FITS
+    assert fit_of_run(run_of(cured(log, mistake))).mean < FITS
 
 
 def test_a_sensor_that_is_turned_over_later_is_named_with_the_time() -> None:
@@ -99,7 +99,7 @@ def test_a_sensor_that_is_turned_over_later_is_named_with_the_time() -> None:
     assert (mistake.name, mistake.since_s) == ("bearing_sign", pytest.approx(16.0, abs=1.0))
     assert not mistake.cure  # none leaves all of the log
     before = replace(log, events=[e for e in log.events if e.t_s < mistake.since_s])
-    assert fit(run_of(before)).mean < FITS
+    assert fit_of_run(run_of(before)).mean < FITS
 
 
 def test_what_most_of_a_log_is_refused_with_does_not_fit_it() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import kalmark as km
 from kalmark.config.building import build_slam, config_dict
-from kalmark.diagnosis.mistakes import measured
+from kalmark.diagnosis.mistakes import change_measurements
 from kalmark.diagnosis.state_readings import NAMES, reasons
 from kalmark.diagnosis.verdict import MISFIT, diagnose
 from kalmark.simulate import load_world
@@ -27,7 +27,7 @@ def run_of(keys: dict[str, float], by: dict[str, tuple[float, ...]], seed: int =
     simulated = simulation(world, seed)
     log = simulated.log
     for sensor, factors in by.items():
-        change = measured({("robot", sensor)}, lambda y, factors=factors: y * factors)
+        change = change_measurements({("robot", sensor)}, lambda y, factors=factors: y * factors)
         log = replace(log, events=[change(event) for event in log])
     config = world.config()
     run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)

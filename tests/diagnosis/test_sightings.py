@@ -31,18 +31,20 @@ def seen(*scans: str, **places: tuple[float, float]) -> Any:
 
 def test_one_thing_is_seen_in_turn_and_two_are_seen_together() -> None:
     in_turn = seen(*12 * ("ac", "bc", "ac", "ac", "bc"), a=NEAR, b=FAR, c=POST)
-    assert [(pair.name, pair.other) for pair in doubled_landmarks.split(in_turn)] == [("a", "b")]
-    assert not doubled_landmarks.split(seen(*12 * ("ac", "bc", "abc", "ac", "bc"), a=NEAR, b=FAR, c=POST))
+    assert [(pair.name, pair.other) for pair in doubled_landmarks.find_split_landmarks(in_turn)] == [("a", "b")]
+    assert not doubled_landmarks.find_split_landmarks(
+        seen(*12 * ("ac", "bc", "abc", "ac", "bc"), a=NEAR, b=FAR, c=POST)
+    )
 
 
 def test_two_sides_of_a_wall_and_scans_of_single_landmarks_say_nothing() -> None:
-    assert not doubled_landmarks.split(seen(*30 * ("ac",), *30 * ("bc",), a=NEAR, b=FAR, c=POST))
-    assert not doubled_landmarks.split(seen(*30 * ("a", "b"), a=NEAR, b=FAR))
+    assert not doubled_landmarks.find_split_landmarks(seen(*30 * ("ac",), *30 * ("bc",), a=NEAR, b=FAR, c=POST))
+    assert not doubled_landmarks.find_split_landmarks(seen(*30 * ("a", "b"), a=NEAR, b=FAR))
 
 
 def test_landmarks_vanish_at_once_or_one_after_the_other() -> None:
     def moments(*scans: str) -> list[tuple[float, int, bool]]:
-        found = doubled_landmarks.vanished(seen(*scans, **dict.fromkeys("abcdefghijkl", NEAR)))
+        found = doubled_landmarks.vanished_landmarks(seen(*scans, **dict.fromkeys("abcdefghijkl", NEAR)))
         return [(moment.t_s, moment.number, moment.score > 0.0) for moment in found]
 
     before, after = 90 * ("abcdef",), 90 * ("ghijkl",)
@@ -58,7 +60,7 @@ def test_landmarks_vanish_at_once_or_one_after_the_other() -> None:
 def test_landmarks_that_ids_tell_do_not_vanish() -> None:
     run = seen(*90 * ("abcdef",), *90 * ("ghijkl",))
     run.history.id = run.history.landmark
-    assert doubled_landmarks.vanished(run) == []
+    assert doubled_landmarks.vanished_landmarks(run) == []
 
 
 @pytest.mark.parametrize("carried_m", [0.0, 5.0])
@@ -117,7 +119,7 @@ def test_scans_that_are_late_are_named_before_the_map_that_they_double_by_the_ve
         Scan(t_ns=e.t_ns + 200_000_000, robot="rover", sensor="laser", y=e.y) if isinstance(e, Scan) else e
         for e in log.events
     ]
-    verdict = km.diagnose(mapped(replace(log, events=sorted(late, key=km.events.order))), VERDICT_OBSERVATIONS)
+    verdict = km.diagnose(mapped(replace(log, events=sorted(late, key=km.events.sort_key))), VERDICT_OBSERVATIONS)
     names = [cause.name for cause in verdict.causes]
     assert (verdict.map, names[0]) == ("wrong", "time_offset")
     assert "map_repeats" in names

@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.batch.batch_state import LANDMARKS
-from kalmark.batch.data import replayed
+from kalmark.batch.data import replay_events
 from kalmark.batch.problem import sightings
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.linear import Linear
@@ -20,7 +20,7 @@ from kalmark.geometry.frames import compose
 from kalmark.geometry.frames3d import compose as compose3d
 from kalmark.geometry.rotations import exp
 from kalmark.models.observe import view_of
-from kalmark.results.batch import given_by
+from kalmark.results.batch import batch_input
 from kalmark.simulate import load_world, simulate
 
 PLANE = ("world.count=30", "world.size_m=24", "steps=400", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")
@@ -57,8 +57,8 @@ def test_a_sensor_that_is_turned_by_ten_degrees_on_the_way_is_named_first() -> N
 def test_the_turn_of_a_mount_matches_differences(name: str, options: tuple[str, ...]) -> None:
     world = load_world(name, options)
     log = simulate(world, 3)
-    given = given_by(km.record(build_slam(world.config(), log), log, progress=False))
-    problem, h = replayed(given, log), 1e-6
+    given = batch_input(km.record(build_slam(world.config(), log), log, progress=False))
+    problem, h = replay_events(given, log), 1e-6
     linear = Linear.of(problem, problem.start)
     f, factor = next((f, o) for f, o in enumerate(problem.factors) if o.term.blocks[-1].group == LANDMARKS)
     mount = given.robots[factor.sensor[0]].sensors[factor.sensor[1]]

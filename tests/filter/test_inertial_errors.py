@@ -19,7 +19,7 @@ def rested(motion: Any, yaw_rad: float, sigma_rad: float, kind: str) -> km.Slam:
     start[5], start[6] = math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)
     cov[5, 5], cov[9:15, 9:15] = sigma_rad**2, 1e-4 * np.eye(6)
     still = np.tile([0.001, 0.002, -0.001, 0.01, -0.02, 9.81], (500, 1))
-    rest = km.motion.at_rest(motion, RATE_S * np.arange(500), still, start, cov)
+    rest = km.motion.start_at_rest(motion, RATE_S * np.arange(500), still, start, cov)
     compass = km.Mount(km.sensors.Heading(sigma_heading_rad=1e-3))
     slam = km.Slam(km.Robot("unit", motion, rest.start, cov=rest.cov, sensors={"compass": compass}), map=kind)
     for i in range(200):

@@ -8,7 +8,7 @@ import pytest
 import kalmark as km
 from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.map import Pairs
-from kalmark.filter.nearest_blocks import distances, paired
+from kalmark.filter.nearest_blocks import distances, nearest_pairs
 
 
 def field(map_: str) -> tuple[km.Slam, np.ndarray]:
@@ -63,7 +63,7 @@ def test_the_least_of_each_row_are_told(nearest: int) -> None:
     p, places = rng.uniform(0, 9, (5, 3)), rng.uniform(0, 9, (40, 3))
     gaps = np.linalg.norm(p[:, None] - places, axis=2)
     np.testing.assert_allclose(distances(p, places), gaps)
-    rows, numbers, used = paired(p, places, nearest, 2.0)
+    rows, numbers, used = nearest_pairs(p, places, nearest, 2.0)
     columns = used[numbers]
     for k in range(5):
         wanted = [i for i in np.argsort(gaps[k])[:nearest].tolist() if gaps[k, i] <= 2.0 * gaps[k].min()]
@@ -71,7 +71,7 @@ def test_the_least_of_each_row_are_told(nearest: int) -> None:
 
 
 def test_without_landmarks_none_is_near() -> None:
-    assert not any(len(found) for found in paired(np.zeros((3, 2)), np.zeros((0, 2)), 4, 10.0))
+    assert not any(len(found) for found in nearest_pairs(np.zeros((3, 2)), np.zeros((0, 2)), 4, 10.0))
 
 
 @pytest.mark.parametrize("slots", [[5, 0], [0, 399, 5, 200], [300, 301], [7, 7, 250]])

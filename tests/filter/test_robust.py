@@ -46,7 +46,7 @@ def test_weights_are_those_of_iterated_least_squares_in_textbook_form(student: b
     m, robot, mount, here = slam.map.marginal(slam.slot("r"), -1, slots)
     scan = robot, mount, here, 2, y, R, k
     found = corrections.compiled_weighed(model.model, m.whole, scan, student)
-    np.testing.assert_allclose(corrections.weighed(model.model, m.whole, scan, student), found, rtol=1e-9)
+    np.testing.assert_allclose(corrections.robust_noise(model.model, m.whole, scan, student), found, rtol=1e-9)
     # textbook: x is free with the prior P, each residual has a weight
     e, H_r, H_l = km.geometry.observe(np.zeros(3), places)
     H = np.zeros((10, 13))

@@ -88,7 +88,7 @@ def driven(seed: int, kind: str, seconds: float = 20.0) -> float:
     walk = rng.normal(0, UNIT.densities[6:] * math.sqrt(DT_S), (n, 6))
     biases = rng.normal(0, np.repeat([1e-3, 0.03], 3)) + np.cumsum(walk, axis=0)
     read = u + biases + rng.normal(0, UNIT.densities[:6] / math.sqrt(DT_S), u.shape)
-    rest = km.motion.at_rest(UNIT, DT_S * np.arange(n), read, AT16, cov)
+    rest = km.motion.start_at_rest(UNIT, DT_S * np.arange(n), read, AT16, cov)
     unit = km.Robot("unit", UNIT, rest.start, cov=rest.cov, rests_until_ns=round(rest.until_s * 1e9))
     eye = km.Mount(km.sensors.Position3D(0.3, 0.3, 0.3), at=AT)
     slam = km.Slam([unit, km.Robot("tower", km.motion.Odometry3D(), AT, {"eye": eye})], map=kind)
@@ -125,7 +125,7 @@ def test_a_heading_that_one_scan_of_known_landmarks_finds_leaves_biases_as_sure_
             rng.normal(0, [1e-3] * 3 + [0.03] * 3),
         )
         read = np.array([0.0, 0, 0, 0, 0, 9.81]) + x[10:] + rng.normal(0, UNIT.densities[:6] / DT_S**0.5, (100, 6))
-        rest = km.motion.at_rest(UNIT, DT_S * np.arange(100), read, AT16, prior)
+        rest = km.motion.start_at_rest(UNIT, DT_S * np.arange(100), read, AT16, prior)
         until_ns = round(rest.until_s * 1e9)
         slam = km.Slam(km.Robot("unit", UNIT, rest.start, {"laser": laser}, rest.cov, rests_until_ns=until_ns))
         for i, place in enumerate(places):
@@ -194,15 +194,17 @@ def test_a_correction_along_what_a_robot_and_its_mount_leave_open_moves_no_senso
     P = N @ np.diag(rng.uniform(0.01, 0.04, k)) @ N.T + 1e-10 * np.eye(2 * k)
     d, after, moved = N @ rng.normal(0, 0.3, k), x.copy(), retract_plane if plane else retract
     rows = gauge_transport.turning_rows(space.atoms, (n, 2 * n, t, 2 * k, 0, 0), H)
-    R, turn = gauge_transport.frame_of(x, 0, t), gauge_transport.gauge(x, d, rows, t)
-    L = gauge_transport.leaning(P[rows[0]], rows[0], space.atoms, rows, t, R, False)
-    E, W, d_lean = gauge_transport.turns_of(turn, d, rows, t)
+    R, turn = gauge_transport.rotation_at(x, 0, t), gauge_transport.gauge(x, d, rows, t)
+    L = gauge_transport.regression_on_units(P[rows[0]], rows[0], space.atoms, rows, t, R, False)
+    E, W, d_lean = gauge_transport.turn_matrices(turn, d, rows, t)
     moved(space.atoms, after, d, turn)
     gauge_transport.carry(space.atoms, after, L, W, d_lean)
     np.testing.assert_allclose(chain(*np.split(after, [n]))[0], chain(*np.split(x, [n]))[0], atol=1e-6)
     then, now = ((generator_plane if plane else generator)(space.atoms, at, 2 * k, t, x[:3]) for at in (x, after))
     A = np.eye(2 * k)
-    R_now = gauge_transport.frame_of(after, 0, t)
-    A[:, rows[0]] += gauge_transport.displaced(space.atoms, now, then, L, E, d_lean, rows, rows[0], R, R_now, 0)
+    R_now = gauge_transport.rotation_at(after, 0, t)
+    A[:, rows[0]] += gauge_transport.displacement_columns(
+        space.atoms, now, then, L, E, d_lean, rows, rows[0], R, R_now, 0
+    )
     np.testing.assert_allclose(jacobian(after) @ A @ N, 0.0, atol=1e-6)
     assert np.abs(jacobian(after) @ N).max() > 0.1

@@ -10,15 +10,15 @@ import pytest
 
 from command_line import write_log
 from differences import derivative
-from kalmark.datasets.g2o import control
+from kalmark.datasets.g2o import increment_of_edge
 from kalmark.errors import LogError
 from kalmark.events import Control, Fix, Scan
 from kalmark.geometry import frames3d, rotations
 from kalmark.logs import open_log
-from kalmark.logs.poses import in_space, read_path, tum_text, write_path
-from kalmark.logs.source import Request, raising
+from kalmark.logs.poses import poses_in_space, read_path, tum_text, write_path
+from kalmark.logs.source import Request, raise_refusal
 
-REQUEST = Request(None, raising, [])
+REQUEST = Request(None, raise_refusal, [])
 
 
 def random_poses(seed: int = 0, n: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +55,7 @@ def test_another_library_reads_the_poses(tmp_path: Path) -> None:
 
 
 def test_poses_of_the_plane_are_at_height_0() -> None:
-    np.testing.assert_allclose(in_space(np.array([[1, 2, np.pi]])), [[1, 2, 0, 0, 0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(poses_in_space(np.array([[1, 2, np.pi]])), [[1, 2, 0, 0, 0, 1, 0]], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_poses_of_the_plane_are_at_height_0() -> None:
 def test_poses_of_tum_are_read_as_programs_write_them(name: str, text: str, t_ns: int, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text)
     skipped: list[str] = []
-    path = read_path(tmp_path / name, Request(None, raising, skipped))
+    path = read_path(tmp_path / name, Request(None, raise_refusal, skipped))
     assert path.t_ns.tolist() == [t_ns]
     np.testing.assert_allclose(path.poses, [[1, 2, 3, 0, 0, 0.5**0.5, 0.5**0.5]], atol=1e-12)
     assert skipped == ([f"{tmp_path / name}: 1 positions of NaN, which are none"] if "nan" in text else [])
@@ -194,7 +194,7 @@ def test_the_errors_of_an_edge_are_those_of_g2o() -> None:
         return np.append(X[:3], rotations.log(X[3:]))
 
     J = derivative(increment, np.zeros(6))
-    u, C = control(Z, np.eye(6))
+    u, C = increment_of_edge(Z, np.eye(6))
     np.testing.assert_allclose(u, increment(np.zeros(6)), atol=1e-12)
     np.testing.assert_allclose(C, J @ J.T, atol=1e-6)
 

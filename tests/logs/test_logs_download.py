@@ -154,8 +154,8 @@ def test_a_server_that_is_not_there_is_one_clear_line(mirror: Server, monkeypatc
 def test_a_name_that_is_not_resolved_and_a_server_that_is_silent_are_told_in_a_few_words() -> None:
     lost = requests.ConnectionError(MaxRetryError(None, "/", NewConnectionError(None, "Failed to resolve")))  # type: ignore[arg-type]
     lost.args[0].reason.__cause__ = OSError(-2, "Name not known")
-    assert download.innermost(lost) == "name not known"
-    assert download.innermost(requests.ReadTimeout(ReadTimeoutError(None, "/", "Read timed out."))) == (  # type: ignore[arg-type]
+    assert download.innermost_reason(lost) == "name not known"
+    assert download.innermost_reason(requests.ReadTimeout(ReadTimeoutError(None, "/", "Read timed out."))) == (  # type: ignore[arg-type]
         "no answer in time"
     )
 

@@ -18,11 +18,11 @@ from kalmark.diagnosis.repeated_events import copies
 from kalmark.errors import EventError
 from kalmark.events import Event
 from kalmark.geometry import frames, frames3d
-from kalmark.logs.increments import CUT, cut, part_of, unevenness
+from kalmark.logs.increments import CUT, cut_increments, part_of, unevenness
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.overflow import overflows
 from kalmark.models.observe import step, step_of
-from kalmark.slam.held_control import noise_of
+from kalmark.slam.held_control import control_covariance
 
 PLANE, SPACE, WHEELS = CUT
 WHOLE = {PLANE: [0.4, 0.1, 0.9], SPACE: [0.4, 0.1, -0.2, 0.3, -0.5, 0.7], WHEELS: [2.0, 3.1]}
@@ -58,7 +58,7 @@ def test_half_of_a_turn_ends_on_its_circle() -> None:
 
 
 def test_a_scan_within_an_increment_cuts_it() -> None:
-    found = [e for e in cut(log_of(drive(2.25, 2.75, 5.0))) if isinstance(e, Control)]
+    found = [e for e in cut_increments(log_of(drive(2.25, 2.75, 5.0))) if isinstance(e, Control)]
     assert [e.t_s for e in found] == [1, 2, 2.25, 2.75, 3, 4, 5, 6, 7, 8]
     assert [e.share for e in found] == [1, 1, 0.25, 0.5, 0.25, 1, 1, 1, 1, 1]
 
@@ -67,8 +67,8 @@ def test_parts_share_the_noise_of_the_whole() -> None:
     motion, N = km.motion.Odometry2D(sigma_x_m=0.1, sigma_y_m=0.2, sigma_theta_rad=0.3), np.diag([4.0, 5.0, 6.0])
     for cov, whole in ((None, np.diag([0.01, 0.04, 0.09])), (N, N)):
         events: list[Event] = [Control(k, "rover", WHOLE[PLANE], cov) for k in (1, 2, 3)]
-        found = [e for e in cut(log_of([*events, *drive(1.3, 1.6, number=0)])) if isinstance(e, Control)]
-        assert_allclose(sum(noise_of(motion, e) for e in found if 1 < e.t_s <= 2), whole)
+        found = [e for e in cut_increments(log_of([*events, *drive(1.3, 1.6, number=0)])) if isinstance(e, Control)]
+        assert_allclose(sum(control_covariance(motion, e) for e in found if 1 < e.t_s <= 2), whole)
 
 
 @pytest.mark.parametrize(("a", "b"), [(0.0, 0.3), (0.3, 0.5), (0.5, 1.0), (0.1, 0.9)])
@@ -81,7 +81,7 @@ def test_unevenness_is_that_of_a_step_at_any_time(a: float, b: float) -> None:
 def test_a_turn_that_begins_within_an_increment_makes_its_parts_uncertain() -> None:
     turn = [[0.4, 0.0, w] for w in (0.0, 0.0, 0.0, 0.5, 1.0, 1.0, 1.0)]
     events: list[Event] = [Control(k, "rover", u) for k, u in enumerate(turn, start=1)]
-    found = cut(log_of([*events, *drive(2.5, 3.5, 6.5, number=0)]))
+    found = cut_increments(log_of([*events, *drive(2.5, 3.5, 6.5, number=0)]))
     more = {e.t_s: e.uneven[2] for e in found if isinstance(e, Control) and e.uneven is not None}
     assert_allclose(
         [more[t_s] for t_s in (2.5, 3.0, 3.5, 4.0, 6.5, 7.0)], np.array([0, 0, 1, 1, 0, 0]) / 48, atol=1e-12
@@ -119,14 +119,14 @@ def test_a_part_of_rates_is_refused_and_changes_nothing(motion: Any) -> None:
 
 
 def test_the_first_increment_began_one_interval_before_its_end() -> None:
-    log = cut(log_of(drive(-0.5, 0.25)))
+    log = cut_increments(log_of(drive(-0.5, 0.25)))
     assert [e.t_s for e in log][:3] == [-0.5, 0.25, 0.25]
     assert begins_at(log.events[1:], "rover", held=False) == 0
 
 
 def test_two_increments_at_one_time_are_left_as_they_are() -> None:
     events: list[Event] = [Control(t_s, "rover", WHOLE[PLANE]) for t_s in (1, 2, 2, 3)]
-    found = [e for e in cut(log_of([*events, *drive(2.5, number=0)])) if isinstance(e, Control)]
+    found = [e for e in cut_increments(log_of([*events, *drive(2.5, number=0)])) if isinstance(e, Control)]
     assert [(e.t_s, e.share) for e in found] == [(1, 1), (2, 1), (2, 1), (2.5, 0.5), (3, 0.5)]
 
 
@@ -134,20 +134,20 @@ def test_a_gap_is_not_cut() -> None:
     """Of a gap nobody knows when its increment began: it stays whole, and the gap is noticed."""
     after: list[Event] = [Control(14 + k, "rover", WHOLE[PLANE]) for k in range(8)]
     events = [*drive(9.5, 11.5), *after]
-    found = [e for e in cut(log_of(events)) if isinstance(e, Control)]
+    found = [e for e in cut_increments(log_of(events)) if isinstance(e, Control)]
     assert all(e.share == 1 for e in found)
 
 
 def test_a_robot_is_cut_where_another_sees_it() -> None:
     seen = Scan(2.5, "scout", "camera", [[4.0, 0.2]], ids=["rover"])
-    found = [e for e in cut(log_of([*drive(), seen], robots=("rover", "scout"))) if isinstance(e, Control)]
+    found = [e for e in cut_increments(log_of([*drive(), seen], robots=("rover", "scout"))) if isinstance(e, Control)]
     assert [e.t_s for e in found if e.share < 1] == [2.5, 3]
 
 
 def test_velocities_are_not_cut() -> None:
     events: list[Event] = [Control(k, "rover", [1.0, 0.1]) for k in (1, 2, 3)]
     log = log_of([*events, *drive(1.5, number=0)], columns=("v_mps", "w_radps"))
-    assert cut(log).events == sorted(log.events, key=lambda e: e.t_ns)
+    assert cut_increments(log).events == sorted(log.events, key=lambda e: e.t_ns)
 
 
 def on_a_circle(folder: Path, seed: int) -> Path:
@@ -204,7 +204,7 @@ def test_halves_are_no_copies() -> None:
     """Two halves are equal to the last bit, and no sign of a log that repeats its rows."""
     rng = np.random.default_rng(3)
     steps: list[Event] = [Control(k, "rover", WHOLE[PLANE] + 0.01 * rng.normal(size=3)) for k in range(1, 60)]
-    log = cut(log_of([*steps, *drive(*(np.arange(1, 59) + 0.5), number=0)]))
+    log = cut_increments(log_of([*steps, *drive(*(np.arange(1, 59) + 0.5), number=0)]))
     rover = km.Robot("rover", km.motion.Odometry2D(), sensors={"laser": km.Mount(km.sensors.RangeBearing())})
     run = km.record(km.Slam([rover]), log, progress=False)
     assert [same for same in copies(run, log) if not same.sensor] == []

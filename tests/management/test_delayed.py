@@ -11,7 +11,7 @@ import pytest
 
 import kalmark as km
 from kalmark.errors import ModelError
-from kalmark.geometry import between, bhattacharyya, intersection, wrap
+from kalmark.geometry import bhattacharyya, intersection, relative_frame, wrap
 from kalmark.geometry.frames import compose
 from kalmark.geometry.gaussian import gate
 from kalmark.models.pointwise import jacobian
@@ -51,10 +51,10 @@ def test_rays_meet_where_they_were_drawn_to_with_the_jacobians_of_their_differen
         np.testing.assert_allclose(q, p, atol=1e-9)
         np.testing.assert_allclose(P_a, jacobian(lambda x: intersection(x, b)[0], a), rtol=1e-5, atol=1e-4)
         np.testing.assert_allclose(P_b, jacobian(lambda x: intersection(a, x)[0], b), rtol=1e-5, atol=1e-4)
-        c, C_a, C_b = between(a, b)
+        c, C_a, C_b = relative_frame(a, b)
         np.testing.assert_allclose(compose(a, c)[0][:2], b[:2], atol=1e-12)
-        np.testing.assert_allclose(C_a, jacobian(lambda x: between(x, b)[0], a, (False, False, True)), atol=1e-5)
-        np.testing.assert_allclose(C_b, jacobian(lambda x: between(a, x)[0], b, (False, False, True)), atol=1e-5)
+        np.testing.assert_allclose(C_a, jacobian(lambda x: relative_frame(x, b)[0], a, (False, False, True)), atol=1e-5)
+        np.testing.assert_allclose(C_b, jacobian(lambda x: relative_frame(a, x)[0], b, (False, False, True)), atol=1e-5)
     assert np.isnan(intersection((0.0, 0, 0), (0.0, 1, 0.5))[0]).all(), "they part ahead and meet behind"
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from garden import GARDEN, look, slam_of
-from kalmark.association.ratio import doubtful, log_ratios
+from kalmark.association.ratio import doubtful_pairs, log_ratios
 from kalmark.errors import MapError
 from kalmark.management import merge
 from kalmark.tracks.track import Tracks
@@ -40,8 +40,8 @@ def test_what_pairs_gain_depends_on_those_before_them() -> None:
     assert told[1] > 2, "the second that it fits the first"
     alone = -0.5 * 2 / 4.001 - np.log(4.001) - np.log(2 * np.pi) - np.log(0.5)
     assert told[0] == pytest.approx(alone)
-    assert doubtful(found, 0, 1e3) == [0, 1]
-    assert doubtful(found, 0, 2.0) == []
+    assert doubtful_pairs(found, 0, 1e3) == [0, 1]
+    assert doubtful_pairs(found, 0, 2.0) == []
 
 
 def test_one_sighting_of_a_place_long_unseen_is_held_back_and_several_together_are_not() -> None:

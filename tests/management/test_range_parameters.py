@@ -12,7 +12,7 @@ import kalmark as km
 from kalmark.errors import ModelError
 from kalmark.models.observe import PythonView, linearize, linearize_in_plane, sensor_address, sensor_at, view_of
 from kalmark.models.pointwise import jacobian
-from kalmark.results.filter_description import mounts
+from kalmark.results.filter_description import calibrated_mounts
 from kalmark.results.self_calibration import mount_figures
 
 AT = np.array([0.3, -0.2, 0.4])
@@ -97,7 +97,7 @@ def test_parameters_in_the_map_resume_bit_for_bit_and_are_told_of(tmp_path: Path
         each.process(scan)
     np.testing.assert_array_equal(again.mean("r.s"), slam.mean("r.s"))
     np.testing.assert_array_equal(again.covariance("r", "r.s", 3), slam.covariance("r", "r.s", 3))
-    figures = mount_figures(mounts(slam)[0])
+    figures = mount_figures(calibrated_mounts(slam)[0])
     assert figures["scale"] == pytest.approx(1 / slam.mean("r.s")[3], rel=1e-15)
     assert figures["bias_m"] == pytest.approx(slam.mean("r.s")[4] / slam.mean("r.s")[3], rel=1e-15)
     assert {row["unit"] for row in figures["directions"]} == {"", "m"}

@@ -11,12 +11,12 @@ from repeats import SIGMA_M, WORLDS, World, empty, part
 
 import kalmark as km
 from kalmark.geometry.frames import from_frame
-from kalmark.management.repeated_places import FALSE_ALARMS, displacement, repeats
+from kalmark.management.repeated_places import FALSE_ALARMS, displacement, find_repeats
 from kalmark.results.run import Run
 
 
 def found(slam: km.Slam) -> list[list[tuple[object, object]]]:
-    return [each.pairs for each in repeats(slam.map, slam.tracks)]
+    return [each.pairs for each in find_repeats(slam.map, slam.tracks)]
 
 
 @pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS.keys())
@@ -36,7 +36,7 @@ def test_a_place_that_was_mapped_twice_is_found_with_its_shift_and_turn(share: f
     again = places[np.argsort(np.linalg.norm(places - 15.0, axis=1))[: len(again)]]
     true = {tuple(place): name for place, name in zip(places.tolist(), part(slam, places, rng), strict=True)}
     names = part(slam, from_frame(T, again)[0], rng)
-    (repeat,) = repeats(slam.map, slam.tracks)
+    (repeat,) = find_repeats(slam.map, slam.tracks)
     wanted = {(true[tuple(place)], name) for place, name in zip(again.tolist(), names, strict=True)}
     assert {*repeat.pairs} <= wanted
     assert len(repeat.pairs) >= 0.9 * len(wanted)
@@ -138,7 +138,7 @@ def test_a_displaced_part_is_as_uncertain_as_it_was_off_and_keeps_its_shape() ->
     rng, slam, T = np.random.default_rng(1), empty(), np.array([5.0, 3.0, 0.4])
     places = rng.uniform(0, 30, (60, 2))
     older, newer = part(slam, places, rng), part(slam, from_frame(T, places)[0], rng)
-    (repeat,) = repeats(slam.map, slam.tracks)
+    (repeat,) = find_repeats(slam.map, slam.tracks)
     assert sorted(repeat.newer) == sorted(newer)
     slots = [slam.slot(name) for name in newer]
     moved = displacement(slam.map, slots, repeat)

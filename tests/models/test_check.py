@@ -14,7 +14,7 @@ from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
 from kalmark.models.landmarks import Point2D
 from kalmark.models.model_check import CheckResult, check_model
 from kalmark.models.motion import Unicycle
-from kalmark.simulate.robots import diffused
+from kalmark.simulate.robots import add_diffusion
 
 Array = npt.NDArray[np.float64]
 
@@ -214,5 +214,5 @@ def test_a_robot_of_the_plane_with_a_speed_in_its_state_diffuses_in_its_pose() -
     slam.process(km.Scan(2.0, "r", "l", [[2.0, 0.3]], [1]))
     np.testing.assert_allclose(slam.mean("r")[2:], (1.2, 0.7))
     np.testing.assert_allclose(np.diag(slam.covariance("r"))[2:], (2 * 0.02 + 2 * 0.02**2, 2 * 0.1**2))
-    moved = diffused(Speed(), np.array([0, 0, 1.0, 0.5]), np.zeros(2), 1.0, np.random.default_rng(0))
+    moved = add_diffusion(Speed(), np.array([0, 0, 1.0, 0.5]), np.zeros(2), 1.0, np.random.default_rng(0))
     assert moved[3] == 0.5

@@ -84,9 +84,9 @@ def test_the_place_of_a_sensor_depends_on_the_pose_alone(motion: Any) -> None:
     S, S_h = sensor_at(
         moving_view_of(sensor, landmark, motion, at, SINCE), np.concatenate([r, x]), sensor_address(motion.space.axes)
     )
-    from kalmark.models.observe import composed
+    from kalmark.models.observe import sensor_pose
 
-    np.testing.assert_allclose(S, composed(r, at)[0][: len(S)], atol=1e-14)
+    np.testing.assert_allclose(S, sensor_pose(r, at)[0][: len(S)], atol=1e-14)
     np.testing.assert_array_equal(S_h[:, pose.dof :], 0.0)
     assert S_h.shape[1] == pose.dof + motion.space.dof
 

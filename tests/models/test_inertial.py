@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.filter.prediction import in_world
+from kalmark.filter.prediction import noise_in_world
 from kalmark.geometry.rotations import exp, matrix, multiply
 from kalmark.geometry.spaces import ROTATION, Space
 from kalmark.models.inertial import inertial_noise, second_integral, second_integral_rate
@@ -102,7 +102,7 @@ def gathered(motion: Any, r: Array, u: Array, dt_s: float, parts: int) -> Array:
     for _ in range(parts):
         D = motion.diffusion_at(r, u, dt_s / parts)
         r, R_r, _ = motion.move(r, u, dt_s / parts)
-        P = R_r @ P @ R_r.T + in_world(r, D)
+        P = R_r @ P @ R_r.T + noise_in_world(r, D)
     return P
 
 
@@ -118,7 +118,7 @@ def test_the_noise_is_that_of_the_textbook_over_a_short_time() -> None:
     motion, rng, dt = km.motion.Inertial(*SIGMAS), np.random.default_rng(6), 1e-4
     gyro, gyro_walk, force, force_walk = SIGMAS
     r, u = drawn(motion.space, rng), rng.normal(size=6)
-    D, R_u = in_world(motion.move(r, u, dt)[0], motion.diffusion_at(r, u, dt)), motion.move(r, u, dt)[2]
+    D, R_u = noise_in_world(motion.move(r, u, dt)[0], motion.diffusion_at(r, u, dt)), motion.move(r, u, dt)[2]
     N = np.diag(np.repeat([gyro**2 / dt, force**2 / dt], 3))
     textbook = R_u @ N @ R_u.T
     np.testing.assert_allclose(D[3:9, 3:9], textbook[3:9, 3:9], atol=2e-4 * textbook[3:9, 3:9].max())
@@ -212,7 +212,7 @@ def test_a_start_at_rest_is_as_far_from_the_truth_as_it_says(kind: Any, seconds:
             tilt = np.append(rng.normal(size=2) * 0.3, 0.0)
             truth[3:7] = multiply(heading, exp(tilt))
             start[3:7] = multiply(exp(np.array([0.0, 0.0, -error[5]])), truth[3:7])
-        found = km.motion.at_rest(motion, *readings(motion, truth, seconds, rng), start, np.diag(known**2))
+        found = km.motion.start_at_rest(motion, *readings(motion, truth, seconds, rng), start, np.diag(known**2))
         assert found.until_s >= 0.8 * seconds - 0.2
         d = motion.space.minus(truth, found.start)
         P = found.cov[np.ix_(free, free)]
@@ -230,7 +230,7 @@ def test_the_start_of_euroc_s_drone_is_found_with_its_motors_on(data: Any) -> No
     truth = true[[0, 1, 2, 4, 5, 6, 3, *range(7, 16)]]
     start = np.append(truth[:7], np.zeros(9))
     prior = np.diag(np.square(np.repeat([0.0, 0.01, 0.0, 0.1, 0.1], 3)))
-    found = km.motion.at_rest(motion, np.arange(len(u)) / 200, u, start, prior)
+    found = km.motion.start_at_rest(motion, np.arange(len(u)) / 200, u, start, prior)
     assert 4.0 < found.until_s < 5.2
     d, sigmas = motion.space.minus(truth, found.start), np.sqrt(np.diag(found.cov))
     assert (np.abs(d[9:12]) < 4 * sigmas[9:12]).all(), "the truth is 100 times as far from no bias"
@@ -253,7 +253,7 @@ def test_a_unit_that_does_not_begin_at_rest_is_refused(change: Any, what: str) -
     t, u = readings(motion, start, 2.0, np.random.default_rng(10))
     u = change(u)
     with pytest.raises(km.KalmarkError) as refused:
-        km.motion.at_rest(motion, t[: len(u)], u, start, cov)
+        km.motion.start_at_rest(motion, t[: len(u)], u, start, cov)
     assert what in str(refused.value)
 
 
@@ -263,7 +263,7 @@ def test_the_rest_ends_before_the_motion_begins() -> None:
     cov = np.diag(np.repeat([0, 0, 0, 1e-4, 0.0025], 3))
     t, u = readings(motion, start, 5.0, np.random.default_rng(11))
     u[600:, 3] += 0.5 * (t[600:] - 3.0)  # from 3 s on it accelerates
-    found = km.motion.at_rest(motion, t, u, start, cov)
+    found = km.motion.start_at_rest(motion, t, u, start, cov)
     assert 2.5 < found.until_s < 3.0
 
 
@@ -286,6 +286,6 @@ def test_a_unit_that_shakes_shows_its_noise_and_not_the_motion_of_its_vehicle_or
     white = rng.normal(size=(1200, 6)) * density * np.sqrt(200.0)
     moved = np.sin(2 * np.pi * 1.5 * t)[:, None] * [1.0, 0.5, 2.0, 3.0, 1.0, 2.0]
     hum = 0.5 * np.sin(2 * np.pi * 73.0 * t)[:, None] * np.ones(6)
-    assert km.motion.shaken(t, white + moved + hum) == pytest.approx((0.002, 0.03), rel=0.15)
-    assert max(km.motion.shaken(t, moved)) < 1e-3
-    assert km.motion.shaken(t[:200], white[:200]) == (0.0, 0.0)  # too few
+    assert km.motion.noise_densities(t, white + moved + hum) == pytest.approx((0.002, 0.03), rel=0.15)
+    assert max(km.motion.noise_densities(t, moved)) < 1e-3
+    assert km.motion.noise_densities(t[:200], white[:200]) == (0.0, 0.0)  # too few

@@ -65,7 +65,7 @@ def rng() -> np.random.Generator:
 
 def camera(name: str) -> tuple[int, Array, Array]:
     lens, k, d, size = CAMERAS[name]
-    return cameras.LENSES[lens], cameras.parameters(lens, k, d, size=size), size
+    return cameras.LENSES[lens], cameras.lens_parameters(lens, k, d, size=size), size
 
 
 def pixels(rng: np.random.Generator, size: Array, centre: Array, count: int = 200) -> Array:
@@ -101,25 +101,25 @@ def test_pixels_come_back_through_their_rays_over_the_whole_image(name: str) -> 
     again, E_m = cameras.project(lens, m, par)
     np.testing.assert_allclose(again, y, atol=1e-10, rtol=0)
     np.testing.assert_allclose(E_m @ M_y, np.tile(np.eye(2), (len(y), 1, 1)), atol=1e-9)
-    assert cameras.in_view(lens, m, par, size + 1e-9)[(y > 0).all(axis=1)].all()
+    assert cameras.is_in_view(lens, m, par, size + 1e-9)[(y > 0).all(axis=1)].all()
 
 
 def test_the_lenses_agree_where_one_is_a_case_of_the_other(rng: np.random.Generator) -> None:
     v = rng.uniform([-1, -0.75, 1], [1, 0.75, 1], (50, 3))
-    radial = cameras.project(cameras.RADIAL, v, cameras.parameters("radial", K, (-0.2, 0.05, 0.01), (), SIZE))
-    radtan = cameras.project(cameras.RADTAN, v, cameras.parameters("radtan", K, (-0.2, 0.05, 0, 0, 0.01)))
+    radial = cameras.project(cameras.RADIAL, v, cameras.lens_parameters("radial", K, (-0.2, 0.05, 0.01), (), SIZE))
+    radtan = cameras.project(cameras.RADTAN, v, cameras.lens_parameters("radtan", K, (-0.2, 0.05, 0, 0, 0.01)))
     existing = cameras.project_pinhole(v, np.array(K), np.array([-0.2, 0.05, 0.01]))
     for one, other, third in zip(radial, radtan, existing, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-10)
         np.testing.assert_array_equal(one, third)
-    ideal = cameras.project(cameras.EQUIDISTANT, v, cameras.parameters("equidistant", K))[0]
+    ideal = cameras.project(cameras.EQUIDISTANT, v, cameras.lens_parameters("equidistant", K))[0]
     angle = np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2])
     np.testing.assert_allclose(np.hypot(*((ideal - K[2:]) / K[:2]).T), angle, atol=1e-12)
 
 
 def test_davison_s_lens_is_that_of_monoslam() -> None:
     k, kd = (195.0, 195.0, 162.0, 125.0), 9e-6  # of pixels, SceneLib2
-    par = cameras.parameters("davison", k, (kd * 195**2,))
+    par = cameras.lens_parameters("davison", k, (kd * 195**2,))
     for u, v in ((10.0, 20.0), (300.0, 200.0), (162.0, 125.0)):
         a, b = u - 162.0, v - 125.0
         straight = np.array([a, b]) / np.sqrt(1 - 2 * kd * (a * a + b * b)) / 195.0
@@ -131,7 +131,7 @@ def test_davison_s_lens_is_that_of_monoslam() -> None:
 def test_a_lens_of_one_number_takes_one(lens: str) -> None:
     for wrong in ((), (0.1, 0.2), *(((-1.0,), (4.0,)) if lens == "fov" else ())):
         with pytest.raises(ModelError, match="one number"):
-            cameras.parameters(lens, K, wrong)
+            cameras.lens_parameters(lens, K, wrong)
 
 
 def test_the_pixels_are_those_of_the_formulas_written_out() -> None:
@@ -141,12 +141,14 @@ def test_the_pixels_are_those_of_the_formulas_written_out() -> None:
     s = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     xd = x * s + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * s + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     e, _ = cameras.project(
-        cameras.RADTAN, np.array([[0.6, -0.4, 2]]), cameras.parameters("radtan", K, (k1, k2, p1, p2, k3))
+        cameras.RADTAN, np.array([[0.6, -0.4, 2]]), cameras.lens_parameters("radtan", K, (k1, k2, p1, p2, k3))
     )
     np.testing.assert_allclose(e[0], [K[2] + K[0] * xd[0], K[3] + K[1] * xd[1]], atol=1e-12)
     t, k = math.atan(math.hypot(x, y)), (-0.02, 0.016, -0.009, 0.0017)
     td = t * (1 + k[0] * t**2 + k[1] * t**4 + k[2] * t**6 + k[3] * t**8) / math.hypot(x, y)
-    e, _ = cameras.project(cameras.EQUIDISTANT, np.array([[0.6, -0.4, 2]]), cameras.parameters("equidistant", K, k))
+    e, _ = cameras.project(
+        cameras.EQUIDISTANT, np.array([[0.6, -0.4, 2]]), cameras.lens_parameters("equidistant", K, k)
+    )
     np.testing.assert_allclose(e[0], [K[2] + K[0] * td * x, K[3] + K[1] * td * y], atol=1e-12)
 
 
@@ -156,17 +158,19 @@ def test_nothing_is_seen_behind_a_pin_hole_and_in_the_plane_through_it() -> None
         lens, par, size = camera(name)
         e, E_v = cameras.project(lens, v, par)
         assert np.isnan(e[:3]).all() and np.isnan(E_v[:3]).all() and np.isfinite(e[3]).all()
-        np.testing.assert_array_equal(cameras.in_view(lens, v, par, size), [False, False, False, True])
+        np.testing.assert_array_equal(cameras.is_in_view(lens, v, par, size), [False, False, False, True])
 
 
 def test_a_fisheye_sees_behind_its_plane_up_to_where_its_image_folds() -> None:
     angle = np.array([0.5, math.pi / 2, 1.7, 2.0, 3.0])
     v = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
-    par = cameras.parameters("equidistant", (100, 100, 300, 300), (-0.1,))  # grows up to theta = sqrt(1 / 0.3)
+    par = cameras.lens_parameters("equidistant", (100, 100, 300, 300), (-0.1,))  # grows up to theta = sqrt(1 / 0.3)
     e, _ = cameras.project(cameras.EQUIDISTANT, v, par)
     np.testing.assert_allclose(e[:3, 0], 300 + 100 * angle[:3] * (1 - 0.1 * angle[:3] ** 2), atol=1e-11)
     assert np.isnan(e[3:]).all()
-    np.testing.assert_array_equal(cameras.in_view(cameras.EQUIDISTANT, v, par, np.array([600.0, 600])), [1, 1, 1, 0, 0])
+    np.testing.assert_array_equal(
+        cameras.is_in_view(cameras.EQUIDISTANT, v, par, np.array([600.0, 600])), [1, 1, 1, 0, 0]
+    )
     rays, _ = cameras.back_project(cameras.EQUIDISTANT, np.array([[300 + 121.0, 300], [300 + 122.0, 300]]), par)
     assert np.isfinite(rays[0]).all() and np.isnan(rays[1]).all()  # r_d reaches 1.217
     ahead, _ = cameras.project(cameras.EQUIDISTANT, np.array([[0.0, 0, 3]]), par)
@@ -176,11 +180,11 @@ def test_a_fisheye_sees_behind_its_plane_up_to_where_its_image_folds() -> None:
 @pytest.mark.parametrize("lens", ["radial", "radtan"])
 def test_points_that_fold_back_into_the_image_are_not_in_view(lens: str) -> None:
     d = (-0.3,) if lens == "radial" else (-0.3, 0, 0, 0)  # grows up to r = 1.054, r_d = 0.703
-    par = cameras.parameters(lens, (400, 400, 320, 240), d, () if lens == "radial" else None)
+    par = cameras.lens_parameters(lens, (400, 400, 320, 240), d, () if lens == "radial" else None)
     v = np.array([[1.0, 0, 1], [1.1, 0, 1], [1.7, 0, 1]])
     folded, _ = cameras.project_pinhole(v, np.array([400.0, 400, 320, 240]), np.array([-0.3]))
     assert cameras.in_image(folded, v, SIZE).all()
-    np.testing.assert_array_equal(cameras.in_view(cameras.LENSES[lens], v, par, SIZE), [True, False, False])
+    np.testing.assert_array_equal(cameras.is_in_view(cameras.LENSES[lens], v, par, SIZE), [True, False, False])
     assert np.isnan(cameras.project(cameras.LENSES[lens], v, par)[0][1:]).all()
     if lens == "radtan":
         rays, _ = cameras.back_project(cameras.RADTAN, np.array([[320 + 281.0, 240], [320 + 282.0, 240]]), par)
@@ -188,13 +192,13 @@ def test_points_that_fold_back_into_the_image_are_not_in_view(lens: str) -> None
 
 
 def test_borders_of_the_image_are_in_view() -> None:
-    par = cameras.parameters("radial", (100, 100, 50, 50), size=(100, 100))
+    par = cameras.lens_parameters("radial", (100, 100, 50, 50), size=(100, 100))
     v = np.array([[-0.5, -0.5, 1], [0.5, 0.5, 1], [0.51, 0, 1], [0, -0.51, 1]])
-    np.testing.assert_array_equal(cameras.in_view(cameras.RADIAL, v, par, np.array([100.0, 100])), [1, 1, 0, 0])
+    np.testing.assert_array_equal(cameras.is_in_view(cameras.RADIAL, v, par, np.array([100.0, 100])), [1, 1, 0, 0])
 
 
 def test_the_omnidirectional_lens_is_the_existing_camera(rng: np.random.Generator) -> None:
-    par, size = cameras.parameters("omnidirectional", OMNI_K, OMNI, OMNI_BACK), np.array([1280.0, 800.0])
+    par, size = cameras.lens_parameters("omnidirectional", OMNI_K, OMNI, OMNI_BACK), np.array([1280.0, 800.0])
     y = rng.uniform(0, size, (100, 2))
     k, a, b = (np.array(x, dtype=float) for x in (OMNI_K, OMNI, OMNI_BACK))
     rays = cameras.back_project(cameras.OMNI, y, par)
@@ -204,12 +208,12 @@ def test_the_omnidirectional_lens_is_the_existing_camera(rng: np.random.Generato
     for one, other in zip(*pixels, strict=True):
         np.testing.assert_array_equal(one, other)
     inside = (np.abs(cameras.project(cameras.OMNI, rays[0], par)[0] / size - 0.5) <= 0.5).all(axis=1)
-    np.testing.assert_array_equal(cameras.in_view(cameras.OMNI, rays[0], par, size), inside)
-    assert not cameras.in_view(cameras.OMNI, np.array([[0.01, 0, -1.0]]), par, size)[0]
+    np.testing.assert_array_equal(cameras.is_in_view(cameras.OMNI, rays[0], par, size), inside)
+    assert not cameras.is_in_view(cameras.OMNI, np.array([[0.01, 0, -1.0]]), par, size)[0]
 
 
 def test_a_lens_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ModelError, match=r"lens 'fisheye': expected one of radial, radtan, equidistant"):
-        cameras.parameters("fisheye", K)
+        cameras.lens_parameters("fisheye", K)
     with pytest.raises(ModelError, match=r"distortion \[0\.1, 0\.2, 0\.3\]: radtan expects k1, k2, p1, p2"):
-        cameras.parameters("radtan", K, (0.1, 0.2, 0.3))
+        cameras.lens_parameters("radtan", K, (0.1, 0.2, 0.3))

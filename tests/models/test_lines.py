@@ -237,7 +237,7 @@ def test_the_image_line_passes_through_the_pixels_of_the_plane_and_has_its_jacob
     np.testing.assert_allclose(np.hypot(h[:, 0], h[:, 1]), 1)
     for i in range(200):
         beta = rng.normal(size=(1, 2))
-        p = lines.in_plane(v[i : i + 1] / np.linalg.norm(v[i]), beta)[0]
+        p = lines.vectors_in_planes(v[i : i + 1] / np.linalg.norm(v[i]), beta)[0]
         pixel = cameras.project_pinhole(p, K, np.zeros(0))[0][0]
         assert abs(h[i] @ [*pixel, 1]) < 1e-9 * (1 + abs(pixel).max())
         step = 0.1 * float(np.hypot(*v[i, :2]))
@@ -323,12 +323,12 @@ def test_a_ray_beside_a_line_counts_at_the_nearest_point_and_one_along_it_nowher
 def test_segments_grow_unless_their_ends_are_uncertain_or_seen_along_the_line() -> None:
     old, seen = np.array([[0.0, 1]] * 4), np.array([[0.5, -1], [1.5, 0.5], [0.2, 0.8], [np.nan, 9]])
     grown = [[-1, 1], [0, 1.5], [0, 1], [0, 1]]
-    np.testing.assert_allclose(lines.extended(old, seen), grown)
+    np.testing.assert_allclose(lines.extend_segments(old, seen), grown)
     sigma_px = np.array([12.0, 8, 12, 12])
-    np.testing.assert_allclose(lines.extended(old, seen, sigma_px), [[-1, 0.5], [0, 1.5], [0.2, 0.8], [0, 1]])
-    np.testing.assert_allclose(lines.extended(old, seen, sigma_px, switch_px=20), grown)
+    np.testing.assert_allclose(lines.extend_segments(old, seen, sigma_px), [[-1, 0.5], [0, 1.5], [0.2, 0.8], [0, 1]])
+    np.testing.assert_allclose(lines.extend_segments(old, seen, sigma_px, switch_px=20), grown)
     angles = np.radians([[50.0, 80], [50, 40], [90, 90], [90, 90]])
-    np.testing.assert_allclose(lines.extended(old, seen, angles=angles), [[-1, 1], [0, 1], [0, 1], [0, 1]])
+    np.testing.assert_allclose(lines.extend_segments(old, seen, angles=angles), [[-1, 1], [0, 1], [0, 1], [0, 1]])
 
 
 def seen(p1: Any, p2: Any, least: float = 10.0, T: Array = LOOKING_ALONG_X) -> tuple[bool, Array]:

@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.compiled import address_of
-from kalmark.filter.prediction import in_world
+from kalmark.filter.prediction import noise_in_world
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.observe import VELOCITY, call_velocity, step, step_of
 from kalmark.models.protocols import HasVelocity, coasts, diffusion_of, true_control
@@ -151,7 +151,7 @@ def gathered(motion: Any, r: Array, controls: list[tuple[Array, float]]) -> tupl
         if not motion.held:
             P += R_u @ motion.control_noise(u) @ R_u.T
         if D is not None:
-            P[: len(D), : len(D)] += in_world(r, D)
+            P[: len(D), : len(D)] += noise_in_world(r, D)
     return r, P
 
 

@@ -23,7 +23,7 @@ def listed(x: Any) -> list[Any]:
 
 def camera_pose(robot: Any, mount: Any) -> Array:
     r = frame(np.array(robot))
-    r[3:] = rotations.normalised(r[3:])
+    r[3:] = rotations.normalize(r[3:])
     return frames3d.compose(r, frame(np.array(mount, dtype=float)))[0]
 
 

@@ -17,14 +17,14 @@ Array = np.ndarray[Any, np.dtype[np.float64]]
 
 SIZE = 0.16
 CAMERAS = {
-    "pin-hole": (cameras.RADIAL, cameras.parameters("radial", (1500, 1501, 1025, 1030), size=(2048, 2048))),
+    "pin-hole": (cameras.RADIAL, cameras.lens_parameters("radial", (1500, 1501, 1025, 1030), size=(2048, 2048))),
     "radtan": (
         cameras.RADTAN,
-        cameras.parameters("radtan", (1502.4, 1500.6, 1025.7, 1030.5), (-0.1636, 0.0915, -1.86e-4, -2.03e-4)),
+        cameras.lens_parameters("radtan", (1502.4, 1500.6, 1025.7, 1030.5), (-0.1636, 0.0915, -1.86e-4, -2.03e-4)),
     ),
     "fisheye": (
         cameras.EQUIDISTANT,
-        cameras.parameters("equidistant", (470.3, 470.3, 620.7, 534.9), (-0.0177, -0.0028, 0.007, -0.0031)),
+        cameras.lens_parameters("equidistant", (470.3, 470.3, 620.7, 534.9), (-0.0177, -0.0028, 0.007, -0.0031)),
     ),
 }
 
@@ -129,7 +129,7 @@ def test_the_pose_is_found_from_perfect_corners(
 
 
 def test_a_tag_far_to_the_side_of_a_fisheye_is_found_too() -> None:
-    par = cameras.parameters("equidistant", (470, 470, 620, 535))
+    par = cameras.lens_parameters("equidistant", (470, 470, 620, 535))
     v = np.concatenate([[0.8, -0.1, -0.05], rotations.exp(np.array([0.2, 1.6, 0.1]))])  # behind the plane of the lens
     found, _, rms, _ = tag_pose(cameras.EQUIDISTANT, seen(cameras.EQUIDISTANT, v, par), SIZE, par, 1.0)
     np.testing.assert_allclose(frames3d.minus(found, v), 0, atol=1e-9)
@@ -156,7 +156,7 @@ def test_a_small_tag_has_two_poses_and_the_better_one_is_kept(rng: np.random.Gen
     for _ in range(100):
         y = seen(lens, v, par) + 0.3 * rng.normal(size=8)
         found, _, rms, ambiguity = tag_pose(lens, y, SIZE, par, 0.3)
-        true = tags.refined(lens, y, SIZE, v, par)[2]
+        true = tags.refine_pose(lens, y, SIZE, v, par)[2]
         assert rms <= math.sqrt(true / 4) * (1 + 1e-9)
         ratios.append(ambiguity)
         better += np.linalg.norm(frames3d.minus(found, v)[3:]) < 0.5

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kalmark.results.evaluate import of_a_free_scale, scale_figures, scale_is_free, scale_notes
-from kalmark.results.measures import identity, rigid, rigid_robust, rmse, similarity
+from kalmark.results.evaluate import free_scale_figures, scale_figures, scale_is_free, scale_notes
+from kalmark.results.measures import identity_alignment, rigid, rigid_robust, rmse, similarity
 
 
 def rotation_2d(a: float) -> np.ndarray:
@@ -63,7 +63,7 @@ def test_a_mirror_image_is_never_aligned_by_a_reflection() -> None:
 
 
 def test_no_point_gives_the_identity_and_one_point_a_shift() -> None:
-    assert np.array_equal(rigid(np.empty((0, 2)), np.empty((0, 2))).rotation, identity().rotation)
+    assert np.array_equal(rigid(np.empty((0, 2)), np.empty((0, 2))).rotation, identity_alignment().rotation)
     fit = rigid(np.array([[1.0, 2.0]]), np.array([[4.0, 6.0]]))
     assert np.allclose(fit.rotation, np.eye(2))
     assert np.allclose(fit.shift, [3.0, 4.0])
@@ -119,11 +119,11 @@ def test_a_path_whose_scale_nothing_tells_has_no_nees_and_diverges_by_its_shape_
     truth = np.column_stack([np.cumsum(rng.normal(size=(60, 3)), axis=0), np.tile([0.0, 0.0, 0.0, 1.0], (60, 1))])
     P = np.tile(1e-4 * np.eye(6), (60, 1, 1))
     small = np.column_stack([0.3 * truth[:, :3], truth[:, 3:]])
-    assert of_a_free_scale(small, P, truth) == {
+    assert free_scale_figures(small, P, truth) == {
         "pose_nees": None, "pose_nees_most": None, "pose_nees_world": None, "diverged": False,
     }  # fmt: skip
     lost = small + np.r_[np.zeros(40), np.full(20, 15.0)][:, None] * np.r_[1.0, np.zeros(6)]
-    assert of_a_free_scale(lost, P, truth)["diverged"]
+    assert free_scale_figures(lost, P, truth)["diverged"]
 
 
 def test_one_camera_alone_has_a_free_scale() -> None:

@@ -12,7 +12,7 @@ import kalmark as km
 from kalmark.config import build_slam
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.frames3d import compose, move, plus, to_frame
-from kalmark.results.filter_description import mounts
+from kalmark.results.filter_description import calibrated_mounts
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
@@ -86,7 +86,7 @@ def test_what_was_not_observed_is_warned_of_and_stands_in_every_report(planar: R
     assert "<td>z 1.00</td>" in page
     loaded = Run.load(planar.save(tmp_path / "run"))
     assert loaded.evaluate()["mounts"] == summary["mounts"]
-    saved = mounts(loaded.final_slam())[0]  # the prior is in map.kmk, too
+    saved = calibrated_mounts(loaded.final_slam())[0]  # the prior is in map.kmk, too
     np.testing.assert_array_equal(saved.prior, PRIOR)
 
 
@@ -108,7 +108,7 @@ def test_a_robot_that_drives_straight_on_observes_which_way_its_sensor_looks_but
         slam.process(Control(t_s=k, robot="r", u=(0.2, 0.0, 0.0)))
         seen = np.array([km.geometry.observe(np.array([0.3 + 0.2 * k, 0.1, 0.25]), p)[0] for p in points])
         slam.process(Scan(t_s=k, robot="r", sensor="laser", y=seen, ids=list(range(9))))
-    (mounted,) = mounts(slam)
+    (mounted,) = calibrated_mounts(slam)
     found = directions(mounted.prior, mounted.covariance, mounted.constants)
     assert [round(each.ratio, 6) for each in found[:2]] == [1.0, 1.0]
     assert {next(iter(each.axes)) for each in found[:2]} == {"x", "y"}

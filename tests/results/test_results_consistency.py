@@ -9,10 +9,10 @@ from scipy.stats import chi2
 from kalmark.geometry import V, V_inverse
 from kalmark.results.measures import (
     anees_interval,
-    diverged,
+    has_diverged,
     map_nees,
-    most_nees,
     nees,
+    nees_limit,
     nis,
     point_error,
     pose_error,
@@ -105,20 +105,20 @@ def test_a_run_has_diverged_only_if_far_in_sigmas_and_in_metres() -> None:
     P = np.broadcast_to(0.01 * np.eye(2), (2, 2, 2))
     d = np.array([[0.1, 0.0], [1.5, 0.0]])
     error = np.linalg.norm(d, axis=1)
-    assert diverged(d, P, error, np.array([[0, 0], [20.0, 0]]))
-    assert not diverged(d, P, error, np.array([[0, 0], [100.0, 0]]))
-    assert not diverged(d, 100 * P, error, np.array([[0, 0], [20.0, 0]]))
+    assert has_diverged(d, P, error, np.array([[0, 0], [20.0, 0]]))
+    assert not has_diverged(d, P, error, np.array([[0, 0], [100.0, 0]]))
+    assert not has_diverged(d, 100 * P, error, np.array([[0, 0], [20.0, 0]]))
 
 
 def test_the_most_of_a_mean_nees_is_that_of_one_value_for_an_error_that_lasts_and_less_for_one_that_does_not() -> None:
     rng, N = np.random.default_rng(1), 300
     d, P = rng.normal(size=3), np.tile(np.diag([0.01, 4.0, 1.0]), (N, 1, 1))
-    assert most_nees(np.tile(d, (N, 1)), P) == pytest.approx(chi2.ppf(0.9999, 3))
-    assert most_nees(rng.normal(size=(N, 3)) * [0.1, 2.0, 1.0], P) == pytest.approx(chi2.ppf(0.97, 3))
+    assert nees_limit(np.tile(d, (N, 1)), P) == pytest.approx(chi2.ppf(0.9999, 3))
+    assert nees_limit(rng.normal(size=(N, 3)) * [0.1, 2.0, 1.0], P) == pytest.approx(chi2.ppf(0.97, 3))
     several = np.repeat(rng.normal(size=(4, 3)), 75, axis=0) * [0.1, 2.0, 1.0]
-    assert chi2.ppf(0.97, 3) < most_nees(several, P) < chi2.ppf(0.9999, 3) - 1.0
+    assert chi2.ppf(0.97, 3) < nees_limit(several, P) < chi2.ppf(0.9999, 3) - 1.0
     P[10:] = 0.0
-    assert np.isfinite(most_nees(np.tile(d, (N, 1)), P)) and np.isnan(most_nees(np.ones((2, 3)), P[-2:]))
+    assert np.isfinite(nees_limit(np.tile(d, (N, 1)), P)) and np.isnan(nees_limit(np.ones((2, 3)), P[-2:]))
 
 
 @pytest.mark.parametrize("rho", [0.9, 0.99, 0.999])
@@ -128,6 +128,6 @@ def test_hardly_a_consistent_run_of_errors_that_last_has_a_mean_nees_above_what_
         d, step = rng.normal(size=(400, 3)), np.sqrt(1.0 - rho**2)
         for k in range(1, 400):
             d[k] = rho * d[k - 1] + step * d[k]
-        above += float(np.mean(nees(d, P))) > most_nees(d, P)
-        assert float(np.mean(nees(10.0 * d, P))) > most_nees(10.0 * d, P) or rho == 0.999
+        above += float(np.mean(nees(d, P))) > nees_limit(d, P)
+        assert float(np.mean(nees(10.0 * d, P))) > nees_limit(10.0 * d, P) or rho == 0.999
     assert above <= 2

@@ -20,12 +20,12 @@ from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import ellipse
 from kalmark.logs.log import Log, PositionTrack
 from kalmark.results.evaluate import headline
-from kalmark.results.figure_texts import BATCH, ROBOT, TOTALS, count, figure, header
+from kalmark.results.figure_texts import BATCH, ROBOT, TOTALS, column_header, count, figure
 from kalmark.results.plot import LANDMARK_COLOUR, draw_map, save_map
 from kalmark.results.record import record
-from kalmark.results.report import POINTS, reasons, report_html, series, show
+from kalmark.results.report import POINTS, common_reasons, figure_text, report_html, series
 from kalmark.results.run import Run
-from kalmark.results.scene import Scene, contours, grouped, stretches_of
+from kalmark.results.scene import Scene, contours, group_steps, stretches_of
 from results_world import circle, slam_for
 
 
@@ -148,14 +148,18 @@ def test_the_page_names_figures_in_the_words_of_the_command_line(run: Run, capsy
         if key in of_one_camera:
             continue
         assert key in summary["robots"]["rover"]
-        assert f"<th>{header(label, unit)}</th>" in table and header(label, unit) in printed
+        assert f"<th>{column_header(label, unit)}</th>" in table and column_header(label, unit) in printed
     assert "<td>toolbox: position RMSE</td><td>0.25</td><td>m</td>" in table
     words = re.findall(r"<tr title=\"[^\"]*\"><td[^>]*>([^<]*)</td>", table)
     assert [label for label in words if "_" in label or label == "own"] == ["own"], "only what is unknown has its key"
 
 
 def test_a_share_is_shown_in_per_cent() -> None:
-    assert (show(0.125, "%"), show(0.125), show([0.5, 0.25], "s")) == ("12.5", "0.125", "0.5, 0.25")
+    assert (figure_text(0.125, "%"), figure_text(0.125), figure_text([0.5, 0.25], "s")) == (
+        "12.5",
+        "0.125",
+        "0.5, 0.25",
+    )
 
 
 def test_text_from_a_log_cannot_break_out_of_the_page() -> None:
@@ -193,7 +197,7 @@ def test_reasons_that_differ_in_a_number_are_merged_when_there_are_many(run: Run
     run = recorded(circle(steps=60))
     run.history.outcome[:] = "rejected"
     object.__setattr__(run.history, "reason", np.array([f"d2 {k}.5 too large" for k in range(count)]))
-    assert reasons(run) == [("rejected", "d2 … too large", count)]
+    assert common_reasons(run) == [("rejected", "d2 … too large", count)]
 
 
 def test_the_headline_names_the_key_figures(run: Run) -> None:
@@ -201,8 +205,8 @@ def test_the_headline_names_the_key_figures(run: Run) -> None:
     assert title == "circle · invariant"
     assert figures[:2] == [f"{len(run.landmarks)} landmarks", "60 scans"]
     assert any(figure.startswith("position ") for figure in figures)
-    assert show(None) != show(0.0) == "0"
-    assert show(1234567.0) == "1.235e+06"
+    assert figure_text(None) != figure_text(0.0) == "0"
+    assert figure_text(1234567.0) == "1.235e+06"
 
 
 def test_the_map_shows_whole_ellipses_but_a_huge_one_does_not_blow_it_up(run: Run) -> None:
@@ -234,7 +238,7 @@ def test_no_line_is_drawn_across_a_gap_in_time() -> None:
     (gap,) = nis["gaps"]
     assert nis["t"][gap - 1] < 4.05
     assert nis["t"][gap] >= 8.8, "since the first scan"
-    groups, gaps = grouped(np.array([0, 1, 3, 4, 5, 9]), 10**9 * np.array([0, 1, 2, 30, 31, 32]), 4)
+    groups, gaps = group_steps(np.array([0, 1, 3, 4, 5, 9]), 10**9 * np.array([0, 1, 2, 30, 31, 32]), 4)
     assert (groups.tolist(), gaps.tolist()) == ([0, 0, 0, 1, 1, 2], [1])
     assert stretches_of(10**9 * np.array([0, 5, 10, 15, 70])).tolist() == [0, 0, 0, 0, 1]
 

@@ -13,7 +13,7 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, load_config
 from kalmark.errors import DivergedError, EventError, LogError, RunError
-from kalmark.events import Control, Fix, Scan, order
+from kalmark.events import Control, Fix, Scan, sort_key
 from kalmark.files import replace_file
 from kalmark.filter.estimators import Ekf
 from kalmark.geometry import wrap
@@ -363,7 +363,7 @@ def test_stamps_of_scans_in_another_unit_of_time_are_refused_before_anything_is_
     def events(unit: float) -> list[km.Control | km.Scan]:
         controls = [km.Control(t_s=0.1 * k, robot="a", u=(1.0, 0.0)) for k in range(20)]
         scans = [km.Scan(t_s=0.1 * k * unit, robot="a", sensor="lidar", y=[[4.0, 0.1]], ids=[1]) for k in range(20)]
-        return sorted([*controls, *scans], key=order)
+        return sorted([*controls, *scans], key=sort_key)
 
     def slam() -> km.Slam:
         return km.Slam(km.Robot("a", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())}))

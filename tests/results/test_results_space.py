@@ -21,7 +21,7 @@ from kalmark.results.measures import point_error, pose_error, rotation_error
 from kalmark.results.record import record
 from kalmark.results.recording import tum
 from kalmark.results.run import Run
-from kalmark.results.truth import ORIGIN, Truth, fitted
+from kalmark.results.truth import ORIGIN, Truth, poses_of_size
 from results_space import START, slam_for, spiral
 
 
@@ -93,8 +93,8 @@ def test_trajectories_of_space_are_the_poses_themselves(run: Run) -> None:
 
 def test_truth_of_the_plane_and_of_space_fit_each_other() -> None:
     flat = np.array([[1.0, -2.0, 2.5], [0.0, 0.0, -3.0]])
-    lifted = fitted(flat, 7)
-    np.testing.assert_allclose(fitted(lifted, 3), flat)
+    lifted = poses_of_size(flat, 7)
+    np.testing.assert_allclose(poses_of_size(lifted, 3), flat)
     assert lifted[:, 2].tolist() == [0.0, 0.0]
 
 

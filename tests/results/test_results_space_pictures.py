@@ -17,12 +17,12 @@ import kalmark as km
 from kalmark.errors import RunError
 from kalmark.results.history import Camera
 from kalmark.results.landmark_table import EUCLIDEANS, LINES, OTHERS, shapes
-from kalmark.results.plot import Projection, corners, draw_map, save_map, spacing
+from kalmark.results.plot import Projection, box_corners, draw_map, grid_spacing, save_map
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
-from kalmark.results.scene import Scene, contours, images, trimmed
+from kalmark.results.scene import Scene, clip_line, contours, images
 from results_space import FORWARD, SIGMA, START, slam_for, spiral, with_camera
 
 WRONG = 13
@@ -95,7 +95,7 @@ def test_a_view_puts_what_is_higher_up_and_what_is_right_to_the_right(run: Run, 
     up, right = project(middle + np.eye(3)[2]), project(middle + project.axes[0])
     assert view == "top" or up[1] > 0.1
     assert right[0] == pytest.approx(1.0)
-    assert np.isfinite(project(corners(scene.low, scene.high))).all()
+    assert np.isfinite(project(box_corners(scene.low, scene.high))).all()
 
 
 def test_a_point_at_great_depth_does_not_shrink_the_picture(run: Run) -> None:
@@ -112,15 +112,15 @@ def test_a_point_at_great_depth_does_not_shrink_the_picture(run: Run) -> None:
 
 
 def test_the_grid_is_of_two_metres_or_of_round_numbers() -> None:
-    assert [spacing(size) for size in (0.5, 3.0, 8.0, 16.0, 40.0, 100.0, 1500.0)] == [0.05, 0.5, 2, 2, 2, 10, 200]
+    assert [grid_spacing(size) for size in (0.5, 3.0, 8.0, 16.0, 40.0, 100.0, 1500.0)] == [0.05, 0.5, 2, 2, 2, 10, 200]
 
 
 def test_a_line_is_trimmed_to_the_image_even_where_its_ends_lie_outside() -> None:
     size = (640.0, 480.0)
-    np.testing.assert_allclose(trimmed(np.array([-100.0, 240]), np.array([0.0, 240]), size), [[0, 240], [640, 240]])
-    np.testing.assert_allclose(trimmed(np.array([10.0, 600]), np.array([10.0, 500]), size), [[10, 480], [10, 0]])
-    assert trimmed(np.array([-1.0, 0]), np.array([-1.0, 9]), size) is None
-    assert trimmed(np.array([-10.0, 0]), np.array([0.0, -10]), size) is None
+    np.testing.assert_allclose(clip_line(np.array([-100.0, 240]), np.array([0.0, 240]), size), [[0, 240], [640, 240]])
+    np.testing.assert_allclose(clip_line(np.array([10.0, 600]), np.array([10.0, 500]), size), [[10, 480], [10, 0]])
+    assert clip_line(np.array([-1.0, 0]), np.array([-1.0, 9]), size) is None
+    assert clip_line(np.array([-10.0, 0]), np.array([0.0, -10]), size) is None
 
 
 def test_the_image_shows_what_was_used_and_what_was_rejected(run: Run) -> None:

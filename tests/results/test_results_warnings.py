@@ -14,7 +14,7 @@ import results_space
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.errors import DivergedError
-from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.events import Control, Event, Fix, Scan, sort_key
 from kalmark.logs.log import Log
 from kalmark.models.motion import Unicycle
 from kalmark.models.sensors import Bearing, RangeBearing
@@ -188,7 +188,7 @@ def test_of_two_sensors_the_one_with_the_wrong_noise_is_named() -> None:
     events = [e for e in log if not (isinstance(e, Scan) and e.t_ns % (2 * STEP_NS) == 0)]
     motion = Unicycle(sigma_v_mps=0.05, sigma_w_radps=0.02)
     slam = Slam([Robot("rover", motion, start=start_of(("rover",), "rover"), sensors=sensors)])
-    run = record(slam, replace(log, events=sorted([*events, *eye], key=order)), progress=False)
+    run = record(slam, replace(log, events=sorted([*events, *eye], key=sort_key)), progress=False)
     assert only(run.evaluate()["advice"]).startswith("sensor eye: NIS ")
 
 

@@ -17,7 +17,7 @@ from kalmark.results.plot import draw_map
 from kalmark.results.recording import Recording
 from kalmark.simulate import World, simulate
 from kalmark.simulate.laser import cast
-from kalmark.simulate.layouts import corners
+from kalmark.simulate.layouts import wall_corners
 
 WALLS = [[-4, -3, 5, -3], [5, -3, 5, 4], [5, 4, -4, 4], [-4, 4, -4, -3], [1, 4, 1, 2.5]]
 LASER = {"type": "walls", "beams": 15, "sigma_range_m": 0.02, "range_max_m": 15.0}
@@ -47,10 +47,10 @@ def test_beams_end_at_the_nearest_wall() -> None:
 
 
 def test_corners_are_where_walls_meet() -> None:
-    found = corners(np.array(WALLS, dtype=np.float64))
+    found = wall_corners(np.array(WALLS, dtype=np.float64))
     expected = [[-4, -3], [5, -3], [5, 4], [-4, 4], [1, 4]]
     assert sorted(found.tolist()) == sorted(map(list, expected))
-    assert len(corners(np.array([[0.0, 0, 1, 0], [1.0, 0, 2, 0]]))) == 0  # one line
+    assert len(wall_corners(np.array([[0.0, 0, 1, 0], [1.0, 0, 2, 0]]))) == 0  # one line
 
 
 def test_a_world_of_walls_without_ends_or_beside_tags_is_refused() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kalmark.config.opening import merged
+from kalmark.config.opening import merge_trees
 from kalmark.errors import ConfigError
 from kalmark.simulate import World, load_world, shipped_worlds, simulate
 from kalmark.simulate.layouts import (
@@ -28,7 +28,7 @@ from kalmark.simulate.layouts import (
     TexturedRoom,
     ThickCloister,
 )
-from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control
+from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control_of_velocity
 from kalmark.simulate.sights import SimulatedSensing
 from kalmark.simulate.worlds import SimulatedRobot
 
@@ -136,7 +136,7 @@ def test_every_motion_is_told_to_drive_the_same_arc(w: float) -> None:
     from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
 
     start = np.array([1.0, 2.0, 0.3])
-    ends = [m.move(start, control(m, 2.0, w, 0.5), 0.5)[0] for m in (Odometry2D(), Unicycle(), Ackermann())]
+    ends = [m.move(start, control_of_velocity(m, 2.0, w, 0.5), 0.5)[0] for m in (Odometry2D(), Unicycle(), Ackermann())]
     assert np.abs(np.array(ends) - ends[0]).max() < 1e-12
 
 
@@ -162,7 +162,7 @@ def test_a_world_without_ids_is_associated_by_distance() -> None:
 def test_laying_over_replaces_a_section_of_another_type() -> None:
     below = {"motion": {"type": "unicycle", "sigma_v_mps": 1.0}, "start": {"x_m": 1.0}}
     above = {"motion": {"type": "odometry_2d"}, "start": {"y_m": 2.0}}
-    assert merged(below, above) == {"motion": {"type": "odometry_2d"}, "start": {"x_m": 1.0, "y_m": 2.0}}
+    assert merge_trees(below, above) == {"motion": {"type": "odometry_2d"}, "start": {"x_m": 1.0, "y_m": 2.0}}
 
 
 @pytest.mark.parametrize(

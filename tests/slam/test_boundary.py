@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 import kalmark as km
 from kalmark.errors import EventError, KalmarkError, MapError, ModelError
-from kalmark.events import checked_id, seconds
+from kalmark.events import checked_id, seconds_text
 from kalmark.geometry.spaces import Rn
-from kalmark.slam.checks import covariance, measurements
+from kalmark.slam.checks import check_covariance, measurements
 
 NAN, INF = float("nan"), float("inf")
 LIDAR = km.sensors.RangeBearing()
@@ -97,7 +97,7 @@ def test_one_landmark_under_two_spellings_is_a_duplicate() -> None:
 # ---------------------------------------------------------------------- times
 @given(st.integers(-(2**63) + 1, 2**63 - 1))
 def test_a_time_in_a_message_is_exact(t_ns: int) -> None:
-    text = seconds(t_ns)
+    text = seconds_text(t_ns)
     assert Fraction(text) == Fraction(t_ns, 10**9)
     assert "e" not in text
     assert not text.endswith(".")
@@ -105,8 +105,8 @@ def test_a_time_in_a_message_is_exact(t_ns: int) -> None:
 
 
 def test_the_time_of_a_real_log_can_be_found_again() -> None:
-    assert seconds(1288971842_161000000) == "1288971842.161"
-    assert [seconds(t) for t in (0, 10**10, -1, -1_500_000_000)] == ["0", "10", "-0.000000001", "-1.5"]
+    assert seconds_text(1288971842_161000000) == "1288971842.161"
+    assert [seconds_text(t) for t in (0, 10**10, -1, -1_500_000_000)] == ["0", "10", "-0.000000001", "-1.5"]
     make = lambda: km.Control(t_ns=1288971842_161000000, robot="r", u=(NAN, 0))  # noqa: E731
     assert refusal(make, EventError) == "control of 'r' at t=1288971842.161 s: u holds nan, expected finite numbers"
     event = km.Scan(t_ns=1288971842_161000000, robot="r", sensor="s", y=[[1, 0, 0]])
@@ -290,7 +290,7 @@ def test_what_only_looks_empty_is_refused() -> None:
 # ---------------------------------------------------------------------- covariances
 def test_a_covariance_is_a_copy() -> None:
     given = np.eye(3)
-    robot, checked = km.Robot("r", km.motion.Unicycle(), cov=given), covariance(given, 3, "cov", definite=True)
+    robot, checked = km.Robot("r", km.motion.Unicycle(), cov=given), check_covariance(given, 3, "cov", definite=True)
     given[0, 0] = -5
     np.testing.assert_array_equal(robot.cov, np.eye(3))
     np.testing.assert_array_equal(checked, np.eye(3))
@@ -313,7 +313,7 @@ def test_a_covariance_is_a_copy() -> None:
     ],
 )
 def test_a_covariance_is_refused_with_the_error_asked_for(error: Any, value: Any, message: str) -> None:
-    assert message in refusal(lambda: covariance(value, 2, "cov", definite=False, error=error), error)
+    assert message in refusal(lambda: check_covariance(value, 2, "cov", definite=False, error=error), error)
 
 
 def test_one_bad_covariance_of_many_is_found_and_shown() -> None:

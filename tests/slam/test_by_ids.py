@@ -70,14 +70,14 @@ WAYS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("names", [("a",), ("a", "b")])
 @pytest.mark.parametrize("way", WAYS)
 def test_both_ways_are_equal(way: str, names: tuple[str, ...], held: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken, corrected = list[bool](), by_ids.corrected
+    taken, corrected = list[bool](), by_ids.correct_by_ids
 
     def counted(*arguments: Any) -> Any:
         report = corrected(*arguments)
         taken.append(report is not None)
         return report
 
-    monkeypatch.setattr(by_ids, "corrected", counted)
+    monkeypatch.setattr(by_ids, "correct_by_ids", counted)
     short, long = (slam_of(names, held, **WAYS[way]) for _ in range(2))
     long.before_scan = lambda *_: None  # which asks for the long way
     for event in sorted(events(names, held), key=lambda event: event.t_ns):

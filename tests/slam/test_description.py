@@ -25,7 +25,7 @@ from kalmark.geometry.rotations import from_euler
 from kalmark.models.landmark_views import Raised
 from kalmark.results.filter_description import configuration
 from kalmark.results.recording import config_yaml
-from kalmark.slam.description import OF_PLACE, describe, model
+from kalmark.slam.description import OF_PLACE, describe, describe_model
 from kalmark.slam.state import Settings
 
 ROLES = (
@@ -134,7 +134,7 @@ def test_every_parameter_of_every_model_is_read_again(role: str, kind: Any) -> N
     world = world_of_class(kind) or "plane"
     for own in parameters(kind):
         made = changed(kind, own.name)
-        said = model(made)
+        said = describe_model(made)
         if isinstance(made, Raised) and said.pop("height_m"):  # it is `mount.z_m`
             continue
         section = Choice(role, world_of_class(kind), typed=registered_name(kind) != role).validated(said)

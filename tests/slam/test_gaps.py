@@ -12,7 +12,7 @@ import pytest
 from hall import alarmed, hall, mapped, right
 
 import kalmark as km
-from kalmark.association.relocalization import aligned
+from kalmark.association.relocalization import align_points
 from kalmark.batch.motion_chain import Chain
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.errors import EventError, ModelError
@@ -123,7 +123,7 @@ def test_points_seen_from_a_pose_give_it_back() -> None:
     rng = np.random.default_rng(0)
     T, v = np.array([3.0, -2.0, 3.0]), rng.uniform(-5, 5, (4, 2))
     l = km.geometry.from_frame(T, v)[0]
-    np.testing.assert_allclose(aligned(v, l, np.array([1.0, 2.0, 0.5, 1.0])), T, atol=1e-12)
+    np.testing.assert_allclose(align_points(v, l, np.array([1.0, 2.0, 0.5, 1.0])), T, atol=1e-12)
 
 
 @pytest.mark.parametrize("held", [False, True])

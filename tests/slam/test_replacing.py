@@ -14,7 +14,7 @@ from kalmark.geometry.angles import rotation
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import POINT2, POINT3, SE2, SE3, Rn, Space
 from kalmark.models.landmarks import AnchoredHomogeneous, Wall2D
-from kalmark.slam.replacing import Shift, moved
+from kalmark.slam.replacing import Shift, shift_block
 
 R = 0.25 * np.eye(2)
 
@@ -98,13 +98,13 @@ def test_the_motion_of_a_block_by_an_error_of_the_shift_matches_differences(spac
     x = space.plus(np.r_[np.zeros(space.size - 1), 1.0], rng.normal(size=space.dof))
     d = 2 if space.world == "plane" or not space.world else 3
     shift = Shift(0.7, rng.normal(size=d), rng.normal(size=d), np.eye(d + 1))
-    new, G = moved(space, x, shift)
+    new, G = shift_block(space, x, shift)
     for k in range(d):
-        other, _ = moved(space, x, shift._replace(t=shift.t + h * np.eye(d)[k]))
+        other, _ = shift_block(space, x, shift._replace(t=shift.t + h * np.eye(d)[k]))
         np.testing.assert_allclose(space.minus(other, new) / h, G[:, k], atol=1e-5)
     turn = rotation(h)  # about the pivot
     about = shift.pivot[:2] + turn @ (shift.t[:2] - shift.pivot[:2])
-    other, _ = moved(space, x, shift._replace(yaw=shift.yaw + h, t=np.r_[about, shift.t[2:]]))
+    other, _ = shift_block(space, x, shift._replace(yaw=shift.yaw + h, t=np.r_[about, shift.t[2:]]))
     np.testing.assert_allclose(space.minus(other, new) / h, G[:, d], atol=1e-5)
 
 

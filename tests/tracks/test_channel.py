@@ -13,7 +13,7 @@ from scipy.stats import chi2
 import kalmark as km
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry import POINT2, SE2
-from kalmark.tracks.channel import Channel, default_landmark, huber_length, in_frame
+from kalmark.tracks.channel import Channel, default_landmark, huber_length, landmarks_in_frame
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.joint_expectation import joint
 from kalmark.tracks.scan import ScanContext, Start
@@ -163,7 +163,7 @@ def test_a_ray_is_as_long_as_its_landmark_is_far() -> None:
     ray = np.array([[1.0, 2.5, 0.5, 0.25]])  # from its anchor 4 m along .5 rad
     end = ray[0, :2] + 4.0 * np.array([math.cos(0.5), math.sin(0.5)])
     T = np.array([3.0, 1.0, 0.3])
-    np.testing.assert_allclose(in_frame(RAY, T, ray), km.geometry.to_frame(T, end[None])[0], atol=1e-9)
+    np.testing.assert_allclose(landmarks_in_frame(RAY, T, ray), km.geometry.to_frame(T, end[None])[0], atol=1e-9)
 
 
 def test_a_sensor_starts_landmarks_of_what_it_finds() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import kalmark as km
 from kalmark.tracks.channel import ObservationModel
-from kalmark.tracks.linearity import SIGMAS, axes, bends, turn_holds, turned
+from kalmark.tracks.linearity import SIGMAS, bends, sigma_point_steps, turn_holds, turn_pose
 
 POINT, ORIGIN = km.landmarks.Point2D(), np.zeros(3)
 
@@ -24,21 +24,23 @@ def test_turns_hold_up_to_a_sigma_of_half_a_radian_about_any_axis() -> None:
 def test_the_squares_of_sigma_points_add_up_to_the_covariance() -> None:
     A = np.random.default_rng(0).normal(size=(3, 3))
     P = 0.05 * A @ A.T
-    steps = axes(P)
+    steps = sigma_point_steps(P)
     np.testing.assert_allclose(steps.T @ steps, SIGMAS**2 * P, atol=1e-12)
     assert (steps[1:, 2] == 0.0).all(), "only the first one turns"
 
 
 def test_a_heading_that_is_unknown_is_looked_at_half_a_turn_away() -> None:
-    steps = axes(np.diag([4.0, 1.0, 2.0**2]))
+    steps = sigma_point_steps(np.diag([4.0, 1.0, 2.0**2]))
     assert steps[0].tolist() == [0.0, 0.0, np.pi]
     np.testing.assert_allclose(np.abs(steps[1:]), [[0.0, 2.0, 0.0], [4.0, 0.0, 0.0]], atol=1e-12)
 
 
 def test_a_step_that_turns_follows_its_arc() -> None:
-    np.testing.assert_allclose(turned(ORIGIN, np.array([np.pi / 2, 0.0, np.pi / 2])), [1.0, 1.0, np.pi / 2], atol=1e-12)
-    np.testing.assert_allclose(turned(ORIGIN, np.array([2.0, 1.0, 0.0])), [2.0, 1.0, 0.0])
-    about = turned(np.array([5.0, 1.0, 3.0]), np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(
+        turn_pose(ORIGIN, np.array([np.pi / 2, 0.0, np.pi / 2])), [1.0, 1.0, np.pi / 2], atol=1e-12
+    )
+    np.testing.assert_allclose(turn_pose(ORIGIN, np.array([2.0, 1.0, 0.0])), [2.0, 1.0, 0.0])
+    about = turn_pose(np.array([5.0, 1.0, 3.0]), np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(about, [5.0, 1.0, 4.0 - 2 * np.pi])
 
 

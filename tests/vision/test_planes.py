@@ -9,9 +9,9 @@ import kalmark as km
 from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, to_frame_many
 from kalmark.simulate.rendering import Rectangle as Wall
 from kalmark.simulate.rendering import Renderer, texture
-from kalmark.vision.appearance import View, predicted, taken
+from kalmark.vision.appearance import View, predict_templates, take_view
 from kalmark.vision.features import Cells
-from kalmark.vision.planes import Plane, measured, shown
+from kalmark.vision.planes import Plane, plane_from_depths, plane_from_match
 from kalmark.vision.template_matching import Searcher
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
@@ -47,7 +47,7 @@ def test_matches_show_a_slanted_wall_and_its_points_do_not_move_once_it_is_known
     images = [renderer.taken(T, rng, noise=1.0, blur_px=0.7)[0] for T in path]
     y = Cells(cv2, 12, 6, 4.0).corners(images[0], np.zeros((0, 2)), 60, 14, 1, np.random.default_rng(1))
     views: list[list[View]] = [
-        [view] for view in (taken(cv2, images[0], one, path[0], CAMERA, 12) for one in y) if view
+        [view] for view in (take_view(cv2, images[0], one, path[0], CAMERA, 12) for one in y) if view
     ]
     rays = CAMERA.rays(y)
     places = rays * (MIDDLE @ NORMAL / (rays @ NORMAL))[:, None]
@@ -55,13 +55,13 @@ def test_matches_show_a_slanted_wall_and_its_points_do_not_move_once_it_is_known
     for learns in (False, True):
         planes = [Plane(view.rays[4]) for (view,) in views]
         for T, image in zip(path[1:], images[1:], strict=True):
-            looks = predicted(cv2, views, [*planes], places, T, CAMERA, 6)
+            looks = predict_templates(cv2, views, [*planes], places, T, CAMERA, 6)
             e = CAMERA.expect(to_frame_many(T, places)[0])[0]
             some = looks.told[np.isfinite(e[looks.told]).all(axis=1)]
             found, scores = Searcher(cv2, image, looks.templates, 0.85).in_discs(some, e[some], np.full(len(some), 4.0))
             for k, at, score in zip(some.tolist(), found, scores, strict=True):
                 if learns and score >= 0.85:
-                    shown(image, looks.templates[k], at, planes[k].slopes, looks.rates[k], planes[k])
+                    plane_from_match(image, looks.templates[k], at, planes[k].slopes, looks.rates[k], planes[k])
         good = scores >= 0.85
         last[learns] = np.median(np.linalg.norm(found - e[some], axis=1)[good]), good.sum()
         tilts = off_deg(np.array([planes[k].normal for k in some[good]]))
@@ -82,12 +82,12 @@ def test_a_depth_image_shows_the_plane_with_the_noise_it_says_and_none_at_an_edg
     for seed in range(200):
         depth = 1.0 / (rho + np.random.default_rng(seed).normal(0.0, DEPTHS.sigma_rho_per_m, rho.shape))
         plane = Plane(m, information=1e-9 * np.eye(2))
-        measured(depth, y, DEPTHS, T, 6, plane)
+        plane_from_depths(depth, y, DEPTHS, T, 6, plane)
         d2.append((plane.slopes - true) @ plane.information @ (plane.slopes - true))
     assert 1.6 < np.mean(d2) < 2.4
     depth[:, 143:] += 0.5
     at_edge = Plane(m)
-    measured(depth, y, DEPTHS, T, 6, at_edge)
+    plane_from_depths(depth, y, DEPTHS, T, 6, at_edge)
     assert not at_edge.slopes.any()
 
 

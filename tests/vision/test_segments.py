@@ -15,7 +15,7 @@ from kalmark.errors import ConfigError
 from kalmark.geometry.frames3d import from_euler_pose
 from kalmark.simulate.rendering import Rectangle, Renderer
 from kalmark.vision.overlay import MATCH
-from kalmark.vision.segments import REACH_PX, LineFrontEnd, compatible, paired, profiles
+from kalmark.vision.segments import REACH_PX, LineFrontEnd, assign_pairs, compatible_segments, profiles
 from kalmark.vision.straight import Straightened
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
@@ -146,10 +146,10 @@ def test_a_segment_can_be_of_a_line_if_it_lies_along_it_the_same_way_round() -> 
         [150.0, 97.0, 160.0, 103.0],  # across
         [180.0, 100.0, 400.0, 103.0],  # farther out the line is known less well
     ])  # fmt: skip
-    may, length = compatible(e, Z, segments, 1.0)
+    may, length = compatible_segments(e, Z, segments, 1.0)
     assert may.tolist() == [[True, False, False, False, False, False]]
     assert length[0, 0] == pytest.approx(70.0)
-    wide, _ = compatible(e, 25.0 * Z, segments, 1.0)
+    wide, _ = compatible_segments(e, 25.0 * Z, segments, 1.0)
     assert wide[0].tolist() == [True, False, True, False, False, False]
 
 
@@ -162,7 +162,7 @@ def test_distances_of_a_segment_have_the_covariance_of_its_own_ends() -> None:
     to_gate = np.sqrt(9.2103 / (direction @ np.linalg.solve(Z_s, direction)))
     for factor, inside in ((0.999, True), (1.001, False)):
         d = factor * to_gate * direction
-        may, _ = compatible(e, Z, np.array([[0.0, d[0], 120.0, d[1]]]), 1.0)
+        may, _ = compatible_segments(e, Z, np.array([[0.0, d[0], 120.0, d[1]]]), 1.0)
         assert may[0, 0] == inside
 
 
@@ -178,8 +178,8 @@ def test_a_profile_is_that_across_the_segment_from_its_dark_side() -> None:
 
 def test_pairs_are_taken_best_first_and_each_once() -> None:
     worth = np.array([[5.0, 9.0, 0.0], [0.0, 8.0, 0.0], [1.0, 0.0, 0.0]])
-    assert paired(worth).tolist() == [1, -1, 0]
-    assert paired(np.zeros((2, 0))).tolist() == [-1, -1]
+    assert assign_pairs(worth).tolist() == [1, -1, 0]
+    assert assign_pairs(np.zeros((2, 0))).tolist() == [-1, -1]
 
 
 def test_a_line_of_the_world_is_straight_in_a_straightened_image() -> None:

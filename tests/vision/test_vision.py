@@ -13,7 +13,7 @@ from kalmark.config import build_slam, open_run
 from kalmark.geometry.frames3d import compose, from_euler_pose, from_frame_many, minus, to_frame_many
 from kalmark.simulate.rendering import Rectangle, Renderer, texture
 from kalmark.tracks.joint_expectation import Prospect
-from kalmark.vision.appearance import predicted, taken
+from kalmark.vision.appearance import predict_templates, take_view
 from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane as Surroundings
@@ -65,10 +65,10 @@ def test_a_patch_is_found_to_a_tenth_of_a_pixel_where_it_appears_from_elsewhere(
     image = renderer.taken(first, rng, noise=1.0, blur_px=0.7)[0]
     now = renderer.taken(then, rng, noise=1.0, blur_px=0.7)[0]
     y = corners(image, 40)
-    views = [[taken(cv2, image, one, first, camera, 12)] for one in y]
+    views = [[take_view(cv2, image, one, first, camera, 12)] for one in y]
     places = places_of(camera, first, y)
     facing = [Surroundings(view.rays[4]) for (view,) in views]
-    looks = predicted(cv2, views, facing, places, then, camera, 6)
+    looks = predict_templates(cv2, views, facing, places, then, camera, 6)
     true = pixels(camera, then, places)
     inside = looks.told[((true > 25) & (true < np.array(now.shape[::-1]) - 25))[looks.told].all(axis=1)]
     assert len(inside) > 12

@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.association.protocol import Decision, Mixture
 from kalmark.errors import EventError
-from kalmark.events import Id, Scan, when
+from kalmark.events import Id, Scan, label_of_event
 from kalmark.filter.estimators import Averaging, Estimator, Update
 from kalmark.filter.map import Map
 from kalmark.report import Observation
@@ -23,10 +23,12 @@ WORTH = 1e-3  # of the likeliest one's weight
 def refuse_averaging(map_: Map, estimator: Estimator, event: Scan) -> None:
     """Refuse, before anything has changed, a scan whose matchings the map or the estimator cannot average over."""
     if not map_.averages:
-        raise EventError(f"{when(event)}: averaging over matchings needs `map: dense`, this one is postponed")
+        raise EventError(f"{label_of_event(event)}: averaging over matchings needs `map: dense`, this one is postponed")
     if not isinstance(estimator, Averaging):
         what = type(estimator).__name__
-        raise EventError(f"{when(event)}: averaging over matchings needs an estimator with `average`, {what} has none")
+        raise EventError(
+            f"{label_of_event(event)}: averaging over matchings needs an estimator with `average`, {what} has none"
+        )
 
 
 class Average(NamedTuple):

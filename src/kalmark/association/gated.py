@@ -82,7 +82,7 @@ class Gated:
         raise NotImplementedError
 
 
-def assigned(d2: Array, gate: float) -> Index:
+def assign(d2: Array, gate: float) -> Index:
     """Return the column for each row of d2 (K, L) whose sum is least, -1 for none, which counts as the gate."""
     from scipy.optimize import linear_sum_assignment
 
@@ -132,7 +132,7 @@ class GlobalAssignment(Gated):
 
     def match(self, query: Query, open_: Index, names: list[Id], d2: Array, gate: float) -> Matched:
         """Pair by the linear assignment of the whole scan, of d2 (K, L)."""
-        return Matched(assigned(d2, gate), {})
+        return Matched(assign(d2, gate), {})
 
 
 @register("association", "jcbb")

@@ -17,7 +17,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags, Index
 from kalmark.association.protocol import NEW, Decision
 from kalmark.association.query import Query
-from kalmark.association.relocalization import aligned, same
+from kalmark.association.relocalization import align_points, is_same_pose
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.report import Observation
@@ -57,7 +57,7 @@ class GlobalPose(NamedTuple):
         return int((self.matched >= 0).sum())
 
 
-def located(query: Query) -> Located:
+def locate_sensor(query: Query) -> Located:
     """Return where the sensor of a scan is in the known map, if the scan determines it."""
     scan, channel = query.scan, query.scan.channel
     of = next((known for kind, known in scan.tracks.known.of_kind.items() if kind in channel.models), None)
@@ -68,7 +68,7 @@ def located(query: Query) -> Located:
     named = [k for k, i in enumerate(query.ids) if i is not None and i in scan.tracks.known]
     if len(named) >= FEWEST_NAMED:
         l = np.array([scan.tracks.known.mean(i)[:2] for i in (query.ids[k] for k in named) if i is not None])
-        return Located(aligned(v[named], l, sigma[named] ** -2), None, "")
+        return Located(align_points(v[named], l, sigma[named] ** -2), None, "")
     unnamed = np.array([k for k, i in enumerate(query.ids) if i is None], dtype=np.int64)
     found = search(of, v[unnamed], sigma[unnamed])
     if isinstance(found, str):
@@ -90,8 +90,8 @@ def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:
     for i, j in bases(v, sigma):
         T = hypotheses(of, v, sigma, i, j)
         tried += len(T)
-        poses += tested(of, v, sigma, T, (i, j))
-    poses = distinct([refined(of, v, sigma, pose) for pose in poses])
+        poses += supported_poses(of, v, sigma, T, (i, j))
+    poses = distinct([refine_pose(of, v, sigma, pose) for pose in poses])
     if not poses:
         return "no pose in the known map explains its scan"
     best = poses[0]
@@ -132,7 +132,7 @@ def hypotheses(of: Known, v: Array, sigma: Array, i: int, j: int) -> Array:
     return np.column_stack([(p[one] + p[other]) / 2 - turned, theta])
 
 
-def tested(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -> list[GlobalPose]:
+def supported_poses(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -> list[GlobalPose]:
     """Return of poses (H, 3) from a base those that most of the scan agrees with."""
     i, j = base
     turn = np.hypot(sigma[i], sigma[j]) / np.linalg.norm(v[j] - v[i])
@@ -141,7 +141,7 @@ def tested(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -
     found: list[GlobalPose] = []
     for at in range(0, len(T), AT_ONCE):
         some = T[at : at + AT_ONCE]
-        gaps, rows = of.tree().query(placed(some, v))
+        gaps, rows = of.tree().query(points_at_poses(some, v))
         near: Flags = gaps**2 <= chi2_gate(REACH, 2) * spread**2
         counts = near.sum(axis=1)
         for h in np.flatnonzero((counts >= FEWEST) & (counts >= counts.max() - AS_GOOD)).tolist():
@@ -150,21 +150,21 @@ def tested(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -
     return [pose for pose in found if pose.pairs > most - AS_GOOD]
 
 
-def placed(T: Array, v: Array) -> Array:
+def points_at_poses(T: Array, v: Array) -> Array:
     """Return where v (K, 2) are from each pose T (H, 3): (H, K, 2)."""
     c, s = np.cos(T[:, 2])[:, None], np.sin(T[:, 2])[:, None]
     return np.stack([c * v[:, 0] - s * v[:, 1] + T[:, :1], s * v[:, 0] + c * v[:, 1] + T[:, 1:2]], axis=2)
 
 
-def refined(of: Known, v: Array, sigma: Array, pose: GlobalPose) -> GlobalPose:
+def refine_pose(of: Known, v: Array, sigma: Array, pose: GlobalPose) -> GlobalPose:
     """Return a pose by least squares of all its pairs, and the pairs from there, of each landmark one."""
     T, matched = pose
     for _ in range(2):
         rows = np.flatnonzero(matched >= 0)
         if len(rows) < FEWEST:
             break
-        T = aligned(v[rows], of.places()[matched[rows]], sigma[rows] ** -2)
-        gaps, nearest = of.tree().query(placed(T[None], v)[0])
+        T = align_points(v[rows], of.places()[matched[rows]], sigma[rows] ** -2)
+        gaps, nearest = of.tree().query(points_at_poses(T[None], v)[0])
         misfit = gaps / sigma
         # the pose has an error of its own: three numbers, from as many pairs
         near = misfit**2 <= chi2_gate(REACH, 2) * (1.0 + 3.0 / len(rows))
@@ -179,7 +179,7 @@ def distinct(poses: list[GlobalPose]) -> list[GlobalPose]:
     """Return poses that are different ones, those with most pairs first."""
     out: list[GlobalPose] = []
     for pose in sorted(poses, key=lambda pose: -pose.pairs):
-        if not any(same(pose.T, other.T) for other in out):
+        if not any(is_same_pose(pose.T, other.T) for other in out):
             out.append(pose)
     return out
 

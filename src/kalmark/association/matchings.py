@@ -50,7 +50,7 @@ def narrow(alive: Flags, m: int, of: Index, landmark: Index, places: Places, gat
 
 
 @compiled
-def possible(alive: Flags, first: Index, i: int) -> int:
+def count_possible(alive: Flags, first: Index, i: int) -> int:
     """Return how many observations from i on have a pair in `alive` (M,)."""
     count = 0
     for j in range(i, len(first) - 1):
@@ -100,7 +100,7 @@ def matchings(  # noqa: C901 - one compiled loop: a recursion without calls
             if not alive[count, m]:
                 continue
             tests += narrow(alive[count], m, of, landmark, places, gate, alive[count + 1])
-        if count + (not skip) + possible(alive[count + (not skip)], first, i + 1) < best - slack:
+        if count + (not skip) + count_possible(alive[count + (not skip)], first, i + 1) < best - slack:
             continue
         if not skip:
             taken[i], count = m, count + 1

@@ -49,7 +49,7 @@ class Posterior(NamedTuple):
 
     def again(self, just: Flags) -> float:
         """Return how many observations are expected to be of landmarks `just` (K, L) seen."""
-        return float(self.weights @ [_again(one, just).sum() for one in self.pairs])
+        return float(self.weights @ [_count_just_seen(one, just).sum() for one in self.pairs])
 
     def why(self, row: int, names: Sequence[object]) -> str:
         """Return what an observation may be, for a reason."""
@@ -66,7 +66,7 @@ def expected_in_gate(d2: Array, gate: float, p: int) -> Array:
     return np.asarray(known.sum(axis=1) * (gate / reach) ** (p / 2))
 
 
-def agreeing(
+def consistent_matchings(
     together: Candidates, open_: Index, d2: Array, near: Flags, gate: float, most: int
 ) -> tuple[Index, bool]:  # fmt: skip
     """Return the largest matchings (N, K) whose pairs agree with each other, and whether the search was finished."""
@@ -92,7 +92,7 @@ def posterior(
     d2 (K, L) are the squared distances of all pairs, `near` those that may be, `just` those of landmarks just seen;
     `gate` is the probability with which a right matching is let through.  At most so many trials are made.
     """
-    found, finished = agreeing(together, open_, d2, near, gate, most)
+    found, finished = consistent_matchings(together, open_, d2, near, gate, most)
     pairs = np.vstack([found, np.full((1, len(d2)), -1)])
     density = together.log_density(open_)
 
@@ -100,7 +100,7 @@ def posterior(
         return _log_likelihood(together, open_, one, density, p, gate)
 
     def share(one: Index) -> float:
-        again, pairs = int(_again(one, just).sum()), int((one >= 0).sum())
+        again, pairs = int(_count_just_seen(one, just).sum()), int((one >= 0).sum())
         return sum(math.lgamma(n + 0.5) for n in (again + experience, pairs - again, len(one) - pairs))
 
     scores = np.array([likelihood(one) + share(one) for one in pairs])
@@ -114,7 +114,7 @@ def posterior(
     weights = np.exp(scores[likely] - scores[likely[0]])
     first = pairs[likely[0]]
     count = int((first >= 0).sum())
-    again = _again(first, just)
+    again = _count_just_seen(first, just)
     others = count - int(again.sum())
     ratio = likelihood(first) - (likelihood(np.where(again, first, -1)) if others else 0.0)  # has the mean 1 by chance
     chance = math.comb(len(d2) - count + (others or count), others or count) * math.exp(-ratio) if count else math.inf
@@ -123,7 +123,7 @@ def posterior(
     return Posterior(pairs[likely], weights / weights.sum(), chance, elsewhere, finished)
 
 
-def _again(pairs: Index, just: Flags) -> Flags:
+def _count_just_seen(pairs: Index, just: Flags) -> Flags:
     """Return which observations a matching (K,) pairs with landmarks just seen, `just` (K, L)."""
     return np.asarray((pairs >= 0) & just[np.arange(len(pairs)), pairs])
 
@@ -139,7 +139,7 @@ def _log_likelihood(together: Candidates, open_: Index, pairs: Index, density: A
     return float(-0.5 * (d2 + log_det + len(rows) * p * np.log(2 * np.pi)) - density[rows].sum())
 
 
-def added(together: Candidates, open_: Index, pairs: Index, row: int, columns: Index) -> float:
+def least_increase(together: Candidates, open_: Index, pairs: Index, row: int, columns: Index) -> float:
     """Return the least that a pair of the observation `row` adds to the d2 of a matching (K,)."""
     rows = np.flatnonzero(pairs >= 0)
     before = together.fit(open_[rows], pairs[rows])[0]

@@ -8,11 +8,11 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.association.matchings import Places
-from kalmark.association.wall_segments import apart
+from kalmark.association.wall_segments import disjoint_from_walls
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import P_AT
-from kalmark.filter.local import beside
+from kalmark.filter.local import append_known
 from kalmark.filter.map import Marginal, Pairs
 from kalmark.filter.observed_block import add_blocks, observed_block
 from kalmark.geometry.density import NEIGHBOURS, log_density, log_volume_change
@@ -115,7 +115,7 @@ class Query:
         if len(mapped) == len(names):
             return read
         known = [name for name in names if name in self._known]
-        read = beside(read, [self._known.model(name).space for name in known], [*map(self._known.mean, known)])
+        read = append_known(read, [self._known.model(name).space for name in known], [*map(self._known.mean, known)])
         at = {name: i for i, name in enumerate(mapped + known)}
         return read._replace(slots=read.slots[[at[name] for name in names]])
 
@@ -160,7 +160,9 @@ class Query:
                 out[some] = model.predict(m, robot, mount, here[l], self.y[k], R)[1]
             if self.scan.channel.joins:
                 tracks = [self.scan.tracks.confirmed[names[i]] for i in l.tolist()]
-                out[some] = np.where(apart(self.scan, model.landmark, tracks, k, out[some]), np.inf, out[some])
+                out[some] = np.where(
+                    disjoint_from_walls(self.scan, model.landmark, tracks, k, out[some]), np.inf, out[some]
+                )
         return out
 
     # ------------------------------------------------------------------ jointly
@@ -223,7 +225,7 @@ class Candidates:
         m, robot, mount, here = self._read
         model, y = self._model, self._scan.y[rows]
         R = self._scan.noise_of(model, m.means(here[columns], model.d), rows)
-        run = corrections.compiled_fit if isinstance(model.model, tuple) else corrections.fit
+        run = corrections.compiled_fit if isinstance(model.model, tuple) else corrections.scan_fit
         scan = robot, mount, here[columns], model.d, y, np.ascontiguousarray(R), np.inf
         d2, log_det = run(model.model, m.whole, scan, LIMITS)
         return float(d2), float(log_det)

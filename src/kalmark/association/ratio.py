@@ -85,7 +85,7 @@ def log_ratios(z: Array, Z: Array, chance: Array, given: int = 0) -> LogRatios:
     return LogRatios(order, np.array(ratios), np.array(bounds))
 
 
-def doubtful(found: LogRatios, given: int, odds: float) -> list[int]:
+def doubtful_pairs(found: LogRatios, given: int, odds: float) -> list[int]:
     """Return the pairs that are not accepted at these odds.
 
     A pair whose place could hold other landmarks begins a group, which ends before the next such pair.  A group is
@@ -99,7 +99,7 @@ def doubtful(found: LogRatios, given: int, odds: float) -> list[int]:
     return out
 
 
-def accepted(query: Query, decisions: list[Decision], odds: float) -> list[Decision]:
+def defer_doubtful_pairs(query: Query, decisions: list[Decision], odds: float) -> list[Decision]:
     """Return the decisions, of pairs that are not accepted at these odds that they are deferred.
 
     Observations with ids are accepted.
@@ -118,6 +118,6 @@ def accepted(query: Query, decisions: list[Decision], odds: float) -> list[Decis
     chance = log_density_about(scan.map, tracks, names, scan.pose()) + change
     found = log_ratios(z, Z, chance, len(sure))
     out, at = list(decisions), dict(zip(found.order, found.ratio.tolist(), strict=True))
-    for i in doubtful(found, len(sure), odds):
+    for i in doubtful_pairs(found, len(sure), odds):
         out[rows[i]] = (DEFERRED, f"{names[i]!r} or a new landmark: the odds are {math.exp(min(at[i], 50.0)):.2g} to 1")
     return out

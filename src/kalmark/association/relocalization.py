@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from kalmark.arrays import Array, Index
-from kalmark.association.posterior import agreeing
+from kalmark.association.posterior import consistent_matchings
 from kalmark.association.query import Query
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
@@ -26,7 +26,7 @@ FITS = 0.999  # of right matchings pass
 SAME_M, SAME_RAD = 0.5, 0.1  # two matchings so near to each other are of one pose
 
 
-def relocalized(query: Query) -> Array | None:
+def relocalize(query: Query) -> Array | None:
     """Return the pose (3,) of the sensor that a scan of points in the plane determines by itself, None if it does not.
 
     Of the largest matchings the one that fits best is taken, unless another one fits from elsewhere.
@@ -43,7 +43,7 @@ def relocalized(query: Query) -> Array | None:
     for matching in matchings:
         rows = np.flatnonzero(matching >= 0)
         columns = matching[rows]
-        T = aligned(v[rows], l[columns], 1.0 / noise[rows])
+        T = align_points(v[rows], l[columns], 1.0 / noise[rows])
         off = l[columns] - from_frame(T, v[rows])[0]
         misfit = float((np.sum(off**2, axis=1) / (noise[rows] + spread[columns])).sum())
         if misfit <= chi2_gate(FITS, 2 * len(rows) - 3):
@@ -51,7 +51,7 @@ def relocalized(query: Query) -> Array | None:
     if not fits:
         return None
     best = min(fits, key=lambda fit: fit[0])[1]
-    return best if all(same(best, T) for _, T in fits) else None
+    return best if all(is_same_pose(best, T) for _, T in fits) else None
 
 
 def _by_constellation(query: Query) -> tuple[list[Id], Index]:
@@ -63,7 +63,7 @@ def _by_constellation(query: Query) -> tuple[list[Id], Index]:
     near = np.isfinite(d2)
     if together is None or not near.any():
         return names, np.zeros((0, size), dtype=np.int64)
-    found, finished = agreeing(together, np.arange(size), d2, near, GATE, MOST_NODES)
+    found, finished = consistent_matchings(together, np.arange(size), d2, near, GATE, MOST_NODES)
     sizes = (found >= 0).sum(axis=1)
     most = sizes.max(initial=0)
     if not finished or most < FEWEST or 2 * most <= size:
@@ -80,7 +80,7 @@ def _by_id(query: Query) -> tuple[list[Id], Index]:
     return names, np.array([[names.index(i) if i in names else -1 for i in query.ids]])
 
 
-def aligned(v: Array, l: Array, weights: Array) -> Array:
+def align_points(v: Array, l: Array, weights: Array) -> Array:
     """Return the pose T (3,) with the least weighted squares of l - T v; v and l are (K, 2)."""
     w = weights / weights.sum()
     a, b = w @ v, w @ l
@@ -90,6 +90,6 @@ def aligned(v: Array, l: Array, weights: Array) -> Array:
     return np.array([x, y, theta])
 
 
-def same(one: Array, other: Array) -> bool:
+def is_same_pose(one: Array, other: Array) -> bool:
     """Return whether two poses (3,) are so near to each other that they are one."""
     return math.dist(one[:2], other[:2]) <= SAME_M and abs(wrap(one[2] - other[2])) <= SAME_RAD

@@ -26,7 +26,7 @@ def gap(one: Array, other: Array) -> Array:
     return np.asarray(np.maximum(one[:, 0] - other[:, 1], other[:, 0] - one[:, 1]))
 
 
-def apart(scan: ScanContext, landmark: Any, tracks: Sequence[Track], rows: Index, d2: Array) -> Flags:
+def disjoint_from_walls(scan: ScanContext, landmark: Any, tracks: Sequence[Track], rows: Index, d2: Array) -> Flags:
     """Return which observations `rows` (M,) do not join what is known of `tracks` of a `Joining` landmark, at d2 (M,).
 
     They do if the gap is at most `join_m` and three sigmas of where the robot is along the wall.

@@ -8,8 +8,15 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.association.gated import Gated, JointCompatibility, assigned
-from kalmark.association.posterior import WELL_KNOWN, Posterior, added, agreeing, expected_in_gate, posterior
+from kalmark.association.gated import Gated, JointCompatibility, assign
+from kalmark.association.posterior import (
+    WELL_KNOWN,
+    Posterior,
+    consistent_matchings,
+    expected_in_gate,
+    least_increase,
+    posterior,
+)
 from kalmark.association.protocol import Answer, Matched
 from kalmark.association.query import Query
 from kalmark.declare import Count, Within, declared, register
@@ -74,14 +81,14 @@ class Weighing(Gated):
         for row in np.flatnonzero(paired & (none >= NONE)).tolist() if not lost else ():
             pairs[row], reasons[row] = NEW, "no landmark is likely there"
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
-            if added(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
+            if least_increase(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
                 pairs[row], reasons[row] = NEW, "no landmark fits there, from where the others are seen"
         query.learn(found.again(just) if found.finished else 0.0)
         return Matched(pairs, reasons, mixed)
 
     def remapped(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:
         """Pair the observations of a lost robot with landmarks just seen, by d2 (K, L); map others again."""
-        pairs = assigned(d2, gate)
+        pairs = assign(d2, gate)
         pairs = np.where(pairs >= 0, pairs, np.where(d2.min(axis=1) > far, REMAP, DEFERRED))
         return Matched(pairs, reasons)
 
@@ -178,7 +185,7 @@ class Cliques(Gated):
         together = query.together(names)
         if together is None:
             return JointCompatibility(self.gate, self.new_gate).match(query, open_, names, d2, gate)
-        found, finished = agreeing(together, open_, d2, np.isfinite(d2), self.gate, self.most_nodes)
+        found, finished = consistent_matchings(together, open_, d2, np.isfinite(d2), self.gate, self.most_nodes)
         sizes, fit = (found >= 0).sum(axis=1), np.full(len(found), np.inf)
         for i, pairs in enumerate(found):
             rows = np.flatnonzero(pairs >= 0)

@@ -13,7 +13,7 @@ from kalmark.errors import LogError
 beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].seen
 
 
-def offered(bag: Bag, name: str, topic: Topic) -> Message:
+def content_of_topic(bag: Bag, name: str, topic: Topic) -> Message:
     """Return what the messages of a topic offer.  Raises LogError if that is not what the topic is to be."""
     kind = bag.topics[name].type
     known = offers(kind, bag.definitions, f"log option topics: {name}", topic)
@@ -50,7 +50,7 @@ class Asked:
         self.bag = bag
         self.topics = {name if topic.topic else bag.find(name): topic for name, topic in topics.items()}
         self.named = {name: bag.find(topic.topic) if topic.topic else name for name, topic in self.topics.items()}
-        self.offers = {name: offered(bag, self.named[name], topic) for name, topic in self.topics.items()}
+        self.offers = {name: content_of_topic(bag, self.named[name], topic) for name, topic in self.topics.items()}
         self.columns = self._controls()
         for name, topic in self.topics.items():
             self._refuse_other_world(name, topic)

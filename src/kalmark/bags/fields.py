@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.messages import MESSAGES, Measured, Message, Place, Pose, Seen, Twist, named
+from kalmark.bags.messages import MESSAGES, Measured, Message, Place, Pose, Seen, Twist, first_id
 from kalmark.bags.topics import Scans, Topic
 from kalmark.errors import LogError
-from kalmark.events import shown, unit_quaternion
+from kalmark.events import short_text, unit_quaternion
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import CANONICAL, FACTORS, GLOBE, INERTIAL, POSE3, POSITION, TWIST3
 
@@ -49,7 +49,9 @@ class Fields:
     def of(cls, where: str, given: Any, scan: bool) -> Fields:
         """Return the paths that a configuration gives of a topic.  Raises LogError."""
         if not isinstance(given, Mapping) or not given or not all(isinstance(p, str) and p for p in given.values()):
-            raise LogError(f"{where}: fields is {shown(given)}, expected a mapping of columns to fields of the message")
+            raise LogError(
+                f"{where}: fields is {short_text(given)}, expected a mapping of columns to fields of the message"
+            )
         paths = {}
         for name, path in given.items():
             stem, _, unit = str(name).rpartition("_")
@@ -59,7 +61,9 @@ class Fields:
                 else (name, 1.0)
             )
             if not scan and column not in OWN:
-                raise LogError(f"{where}: fields has {shown(name)}, expected some of {', '.join(dict.fromkeys(OWN))}")
+                raise LogError(
+                    f"{where}: fields has {short_text(name)}, expected some of {', '.join(dict.fromkeys(OWN))}"
+                )
             paths[column] = (path, factor)
         order = [name for name in CANONICAL if name in paths]
         return cls({name: paths[name] for name in (*order, *(name for name in paths if name not in order))})
@@ -103,11 +107,11 @@ class Fields:
         seen, table = Seen(columns), self.table(m)
         factors = [self.paths[name][1] for name in columns]
         for k, row in enumerate(zip(*(table[name] for name in columns), strict=True)):
-            y = [factor * measured(name, v) for name, v, factor in zip(columns, row, factors, strict=True)]
+            y = [factor * number_of_field(name, v) for name, v, factor in zip(columns, row, factors, strict=True)]
             if not all(map(math.isfinite, y)):
                 seen.left_out["observations that are not finite"] += 1
                 continue
-            seen.add(y, named(scan, table[ID][k]) if ID in table else scan.landmark)
+            seen.add(y, first_id(scan, table[ID][k]) if ID in table else scan.landmark)
         return seen
 
     def numbers(self, m: Any, columns: tuple[str, ...], absent: float = 0.0) -> Array:
@@ -115,7 +119,7 @@ class Fields:
         table = self.table(m)
         if any(len(each) != 1 for each in table.values()):
             raise Refused(f"{len(next(iter(table.values())))} values of each field, expected one")
-        return np.array([measured(c, table[c][0]) * self.paths[c][1] if c in table else absent for c in columns])
+        return np.array([number_of_field(c, table[c][0]) * self.paths[c][1] if c in table else absent for c in columns])
 
     def pose(self, m: Any) -> Pose:
         """Return a pose, its rotation NaN if no field is of one.  Raises Refused."""
@@ -128,11 +132,11 @@ class Fields:
         return Pose(np.append(p, turn), None, "", "")
 
 
-def measured(column: str, v: Any) -> float:
+def number_of_field(column: str, v: Any) -> float:
     """Return a field's number.  Raises Refused if it is none."""
     if isinstance(v, bool | int | float | np.number | np.bool_):
         return float(v)
-    raise Refused(f"the field of {column} is {shown(getattr(v, '__msgtype__', v))}, expected a number")
+    raise Refused(f"the field of {column} is {short_text(getattr(v, '__msgtype__', v))}, expected a number")
 
 
 def value(m: Any, path: str) -> Any:
@@ -155,7 +159,7 @@ def offers(kind: str, definitions: Mapping[str, Any], where: str = "", topic: To
         return Fields.of(where, topic.fields, scan).message(scan)
     if kind in MESSAGES:
         return MESSAGES[kind]
-    found = recognised(kind, definitions)
+    found = landmark_fields(kind, definitions)
     return Fields.of(where, found, scan).message(scan) if found and scan else None
 
 
@@ -176,7 +180,7 @@ def leaves(kind: str, definitions: Mapping[str, Any], before: str = "", depth: i
             yield from leaves(of, definitions, f"{path}.", depth + 1)
 
 
-def recognised(kind: str, definitions: Mapping[str, Any]) -> dict[str, str]:
+def landmark_fields(kind: str, definitions: Mapping[str, Any]) -> dict[str, str]:
     """Return the fields of landmarks in a type of messages: an id with a position, or with a range, a bearing or both.
 
     Told by the names of the fields: elements of an array, arrays of one length, or the message itself; {} if there are
@@ -190,18 +194,18 @@ def recognised(kind: str, definitions: Mapping[str, Any]) -> dict[str, str]:
         ids = [path for path, base in group.items() if _is_id(path) and "float" not in base]
         found = _place(numbers) or _polar(numbers)
         if ids and found:
-            return {ID: min(ids, key=lambda path: words(path)[-1:] != words(path))} | found
+            return {ID: min(ids, key=lambda path: words_of_name(path)[-1:] != words_of_name(path))} | found
     return {}
 
 
-def words(path: str) -> list[str]:
+def words_of_name(path: str) -> list[str]:
     """Return the words of the last name of a path, in the singular."""
     name = path.removesuffix("[]").rpartition(".")[2]
     return [word.rstrip("s") for word in re.sub("([a-z0-9])([A-Z])", r"\1_\2", name).lower().split("_") if word]
 
 
 def _is_id(path: str) -> bool:
-    return words(path)[-1:] == [ID] and not OTHERS & {*words(path)}
+    return words_of_name(path)[-1:] == [ID] and not OTHERS & {*words_of_name(path)}
 
 
 def _place(paths: list[str]) -> dict[str, str]:
@@ -209,8 +213,8 @@ def _place(paths: list[str]) -> dict[str, str]:
     places: dict[str, dict[str, str]] = {}
     for path in paths:
         above, _, _ = path.removesuffix("[]").rpartition(".")
-        if words(path) in (["x"], ["y"], ["z"], ["w"]):
-            places.setdefault(above, {})[f"{words(path)[0]}_m"] = path
+        if words_of_name(path) in (["x"], ["y"], ["z"], ["w"]):
+            places.setdefault(above, {})[f"{words_of_name(path)[0]}_m"] = path
     for above, found in places.items():
         if (
             {*POSITION[:2]} <= found.keys()
@@ -226,7 +230,11 @@ def _polar(paths: list[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for path in paths:
         for column, names in (("range_m", RANGE), ("bearing_rad", BEARING), ("elevation_rad", ELEVATION)):
-            if words(path)[:1] != [] and words(path)[0] in names and {*words(path)[1:]} <= {"m", "rad"}:
+            if (
+                words_of_name(path)[:1] != []
+                and words_of_name(path)[0] in names
+                and {*words_of_name(path)[1:]} <= {"m", "rad"}
+            ):
                 found.setdefault(column, path)
     if "elevation_rad" in found and "bearing_rad" in found:
         found["azimuth_rad"] = found.pop("bearing_rad")

@@ -10,9 +10,9 @@ from typing import Any
 
 from kalmark.bags.configured_topics import short
 from kalmark.bags.first_readings import Readings
-from kalmark.bags.first_sensors import CLUSTERS, IDS, entry_of, is_tag, line_of
+from kalmark.bags.first_sensors import CLUSTERS, IDS, entry_of, is_tag, section_line
 from kalmark.bags.first_start import POSE_M, start_of
-from kalmark.bags.first_words import GUESS, mapping, quoted, told
+from kalmark.bags.first_words import GUESS, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.importer import DAY_NS
 from kalmark.bags.survey import Survey, TopicSummary, yaw
 from kalmark.bags.tf_frames import BASES
@@ -57,7 +57,7 @@ def first_config(found: Survey, file: Path | None = None) -> str:
     head = [
         f"# A first configuration of {found.path.name}, by `kalmark bag`.  Look at each line with {GUESS[:-1]}.",
         "log:",
-        f"  path: {quoted(path)}",
+        f"  path: {yaml_text(path)}",
         "  format: bag",
     ]
     if found.holds_log:
@@ -65,7 +65,7 @@ def first_config(found: Survey, file: Path | None = None) -> str:
         head.append("# robots and sensors are in its configuration: kalmark run CONFIG --log FILE --set log.format=bag")
         return "\n".join([*head, ""])
     if found.definitions:
-        head += ["  definitions:", *(f"    {quoted(kind)}: {quoted(d)}" for kind, d in found.definitions.items())]
+        head += ["  definitions:", *(f"    {yaml_text(kind)}: {yaml_text(d)}" for kind, d in found.definitions.items())]
     writer = _Writer(found)
     lines = writer.lines()
     out = [*head, *lines.log, "  topics:", *(f"    {line}" for line in lines.topics)]
@@ -73,7 +73,7 @@ def first_config(found: Survey, file: Path | None = None) -> str:
     if lines.robots:
         out.append("robots:")
     for robot, section in lines.robots.items():
-        out += [f"  {quoted(robot)}:", *(f"    {line}" for line in section)]
+        out += [f"  {yaml_text(robot)}:", *(f"    {line}" for line in section)]
     out += writer.tail
     return "\n".join(out) + "\n"
 
@@ -129,7 +129,7 @@ class _Writer:
             self.one(robot, topics, out)
         self.clock([self.found.named(entry.get("topic", name)) for name, (entry, _) in out.entries.items()], out)
         for name, (entry, why) in out.entries.items():
-            out.topics.append(f"{quoted(name)}: {mapping(entry)}  # {why}")
+            out.topics.append(f"{yaml_text(name)}: {yaml_mapping(entry)}  # {why}")
         for topic in self.found.topics:
             if not topic.count:
                 out.unused.append(f"{topic.name} ({short(topic.type)}): no messages")
@@ -162,17 +162,17 @@ class _Writer:
             why = f"{GUESS} its wheelbase; " if car else ""
             if kind == "inertial":
                 car, why = {"preset": "mems_imu"}, f"{GUESS} a small unit, whose frame is the robot's; "
-                lines.append(f"start: {mapping(STILL_UNIT)}  # {GUESS} at rest for half a second or more")
-            motion = mapping({"type": kind} | car)
+                lines.append(f"start: {yaml_mapping(STILL_UNIT)}  # {GUESS} at rest for half a second or more")
+            motion = yaml_mapping({"type": kind} | car)
             lines.append(f"motion: {motion}  # {why}its noise has defaults; `kalmark tune` estimates it")
         elif used:
-            lines += [f"motion: {mapping(COASTING[space])}  # {GUESS} there is no topic of controls"]
-            lines += [f"start: {mapping(AT_REST)}  # {GUESS} at rest, about"]
+            lines += [f"motion: {yaml_mapping(COASTING[space])}  # {GUESS} there is no topic of controls"]
+            lines += [f"start: {yaml_mapping(AT_REST)}  # {GUESS} at rest, about"]
         lines += [] if start is None else [readings.start()]
         if scans or readings.sensors:
             lines += ["sensors:", *(f"  {line}" for line in readings.sensors)]
         for topic in scans:
-            lines.append(f"  {line_of(self.found, topic, control, space)}")
+            lines.append(f"  {section_line(self.found, topic, control, space)}")
             if topic.columns == CORNERS or (space and topic.columns == POSE3 and is_tag(topic)):
                 self.tail = ["landmarks: {type: tag}"]
         if lines:
@@ -206,7 +206,7 @@ class _Writer:
             entry = entry_of(topic, space)
             why = f"; {GUESS} the edge of the tags" if "size_m" in entry else ""
             why += f"; {GUESS} these fields, in m and rad, by their names" if topic.stated else ""
-            used[topic.name] = entry, f"{told(topic)}{why}"
+            used[topic.name] = entry, f"{topic_text(topic)}{why}"
         return used
 
     # -------------------------------------------------------------- controls
@@ -242,34 +242,34 @@ class _Writer:
         """Return why this is the control."""
         path = f"its path is {'flat' if topic.poses.frames and topic.poses.flat else 'not flat'}"
         if topic.offers.pose is not None and topic.poses.frames and not topic.poses.moves and topic.turns:
-            return f"{told(topic)}; {GUESS} its velocities, because its poses stand still"
+            return f"{topic_text(topic)}; {GUESS} its velocities, because its poses stand still"
         if topic.offers.pose is not None:
-            return f"{told(topic)}: {path}" + ("" if topic.offers.twist else f"; {GUESS} it is an odometry")
+            return f"{topic_text(topic)}: {path}" + ("" if topic.offers.twist else f"; {GUESS} it is an odometry")
         if topic.offers.rates is not None:
-            return f"{told(topic)}; {GUESS} it moves the robot, as there is no odometry and no velocity"
+            return f"{topic_text(topic)}; {GUESS} it moves the robot, as there is no odometry and no velocity"
         commanded = ", as commanded" if "cmd" in topic.name else ""
-        return f"{told(topic)}; {GUESS} these are velocities of the robot{commanded}"
+        return f"{topic_text(topic)}; {GUESS} these are velocities of the robot{commanded}"
 
     # -------------------------------------------------------------- fixes and truth
     def place(self, topic: TopicSummary) -> tuple[dict[str, Any], str] | None:
         """Return what a topic of positions is, None if it is none or not to be used."""
         if topic.offers.globe is not None and topic.origin is not None:
             if _is_true(topic):
-                return {"type": "truth"}, f"{told(topic)}; {GUESS} by its name: its positions only score"
+                return {"type": "truth"}, f"{topic_text(topic)}; {GUESS} by its name: its positions only score"
             entry: dict[str, Any] = {"type": "fix", "origin": [float(v) for v in topic.origin]}
             if topic.poses.cov is None:
-                why = f"{told(topic)}; {GUESS} sigma_m, as the receiver has no covariance"
+                why = f"{topic_text(topic)}; {GUESS} sigma_m, as the receiver has no covariance"
                 return entry | {"sigma_m": SATELLITE_M}, why
-            return entry, f"{told(topic)}; the origin is the first fix"
+            return entry, f"{topic_text(topic)}; the origin is the first fix"
         if topic.offers.pose is None or not topic.poses.frames:
             return None
         if _is_true(topic):
-            return {"type": "truth"}, f"{told(topic)}; {GUESS} by its name"
+            return {"type": "truth"}, f"{topic_text(topic)}; {GUESS} by its name"
         if topic.offers.twist is None and topic.offers.noisy and not _is_wanted(topic):
             if topic.poses.cov is None:
-                why = f"{told(topic)}; {GUESS} positions in the map, and sigma_m, as they have no covariance"
+                why = f"{topic_text(topic)}; {GUESS} positions in the map, and sigma_m, as they have no covariance"
                 return {"type": "fix", "sigma_m": POSE_M}, why
-            return {"type": "fix"}, f"{told(topic)}; {GUESS} positions in the map, with their covariance"
+            return {"type": "fix"}, f"{topic_text(topic)}; {GUESS} positions in the map, with their covariance"
         return None
 
     def why_not(self, topic: TopicSummary) -> str:

@@ -12,7 +12,7 @@ from kalmark.arrays import Array
 from kalmark.bags.configured_topics import sensor_name
 from kalmark.bags.first_sensors import mount_of
 from kalmark.bags.first_start import Start
-from kalmark.bags.first_words import GUESS, mapping, quoted, told
+from kalmark.bags.first_words import GUESS, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.inertial_messages import heading_of, heading_of_field
 from kalmark.bags.messages import Measured
 from kalmark.bags.survey import Survey, TopicSummary
@@ -29,7 +29,7 @@ STANDARD_GRAVITY, NOT_GRAVITY = 9.80665, 0.2  # m/s^2; a mean force farther off 
 GYRO_RADPS, BIAS = 0.005, {"sigma_bias_radps": 0.01, "sigma_bias_radps_per_sqrt_s": 0.0001}
 
 
-def upward(topic: TopicSummary) -> Array | None:
+def up_direction(topic: TopicSummary) -> Array | None:
     """Return the direction up (3,) in the frame of an inertial unit: that of its mean force where it turned least.
 
     By the quarter of the seconds of least rates: a robot that rests or goes straight on, whose mean acceleration is
@@ -60,9 +60,9 @@ class Readings:
         used = {}
         for topic in sorted(topics, key=lambda each: each.offers.rates is None):  # compasses last
             if {"rates", "attitude"} & topic.first.keys() and (entry := self.unit(topic)) is not None:
-                used[topic.name] = (entry | self.tilt(topic), told(topic))
+                used[topic.name] = (entry | self.tilt(topic), topic_text(topic))
             elif "field" in topic.first and not self.space and self.heading is None:
-                used[topic.name] = (self.compass(topic) | self.tilt(topic), told(topic))
+                used[topic.name] = (self.compass(topic) | self.tilt(topic), topic_text(topic))
         return used
 
     def mount(self, topic: TopicSummary) -> Array | None:
@@ -70,7 +70,7 @@ class Readings:
         known = mount_of(self.found, topic, self.control)
         if known is not None or topic.frame in self.tilted:
             return known if known is not None else self.tilted[topic.frame]
-        up = upward(topic)
+        up = up_direction(topic)
         if up is None or up[2] > LEVEL:
             return None
         turn, _ = rotations.from_euler(np.array([math.atan2(up[1], up[2]), math.asin(-up[0]), 0.0]))
@@ -159,7 +159,7 @@ class Readings:
             at, sigmas = [*at[:2], self.heading], [sigmas[0], NORTH_RAD]
             why = f"{GUESS} its heading is that of its compass"
         keys = ("x_m", "y_m", "theta_rad", "sigma_xy_m", "sigma_theta_rad")
-        return f"start: {mapping(dict(zip(keys, [*at, *sigmas], strict=True)))}  # {why}"
+        return f"start: {yaml_mapping(dict(zip(keys, [*at, *sigmas], strict=True)))}  # {why}"
 
     def named(self, name: str, topic: TopicSummary) -> str:
         """Return the name of a sensor, with that of its topic if another has it."""
@@ -175,4 +175,4 @@ class Readings:
             why = f"{why}; {GUESS} its yaw in the robot, its roll and pitch are by gravity"
         else:
             why = f"{why}; {GUESS} its axes are those of the robot"
-        self.sensors.append(f"{quoted(name)}: {mapping(section)}  # {why}")
+        self.sensors.append(f"{yaml_text(name)}: {yaml_mapping(section)}  # {why}")

@@ -8,7 +8,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.bags.configured_topics import sensor_name
-from kalmark.bags.first_words import GUESS, mapping
+from kalmark.bags.first_words import GUESS, yaml_mapping
 from kalmark.bags.survey import Survey, TopicSummary
 from kalmark.bags.topics import Scans
 from kalmark.geometry.named_poses import describe_pose
@@ -41,17 +41,17 @@ def entry_of(topic: TopicSummary, space: bool) -> dict[str, Any]:
     return entry
 
 
-def line_of(found: Survey, topic: TopicSummary, control: Any, space: bool) -> str:
+def section_line(found: Survey, topic: TopicSummary, control: Any, space: bool) -> str:
     """Return the line of a sensor's section."""
     mount = mount_of(found, topic, control)
-    section, why = model(found, topic, space)
+    section, why = sensor_section(found, topic, space)
     if mount is None:
         section["mount"] = dict.fromkeys(describe_pose(np.array([0.0] * 6 + [1.0])), 0.0) if space else {
             "x_m": 0.0, "y_m": 0.0, "theta_rad": 0.0}  # fmt: skip
         why = f"{why}; {GUESS} the mount: tf does not have {topic.frame or 'its frame'}".removeprefix("; ")
     else:
         why = f"{why}; its mount is that of tf".removeprefix("; ")
-    return f"{sensor_name(topic.name, Scans())}: {mapping(section)}  # {why}"
+    return f"{sensor_name(topic.name, Scans())}: {yaml_mapping(section)}  # {why}"
 
 
 def mount_of(found: Survey, topic: TopicSummary, control: Any) -> Array | None:
@@ -61,7 +61,7 @@ def mount_of(found: Survey, topic: TopicSummary, control: Any) -> Array | None:
     return None if base is None else found.frames.fixed(base, topic.frame)
 
 
-def model(found: Survey, topic: TopicSummary, space: bool) -> tuple[dict[str, Any], str]:
+def sensor_section(found: Survey, topic: TopicSummary, space: bool) -> tuple[dict[str, Any], str]:
     """Return a sensor's section, and why."""
     columns = topic.columns
     if columns[:2] == BEAM and not topic.stated:
@@ -72,7 +72,7 @@ def model(found: Survey, topic: TopicSummary, space: bool) -> tuple[dict[str, An
         section = {"type": "range"} if space else {"type": "range", "initialization": {"type": "trilateration"}}
         return section, "" if topic.stated else f"{GUESS} `landmark` of its topic is what it measures"
     if columns == CORNERS or columns[:1] == ("u_px",):
-        numbers, why = camera(found, topic)
+        numbers, why = camera_of_topic(found, topic)
         return {"type": "tag_corners" if columns == CORNERS else "pinhole"} | numbers, why
     if topic.stated and columns[0] in BEAM:
         kind = "_".join(column.rpartition("_")[0] for column in columns if column in BEAM)
@@ -82,7 +82,7 @@ def model(found: Survey, topic: TopicSummary, space: bool) -> tuple[dict[str, An
     return {"type": kind} | named, ""
 
 
-def camera(found: Survey, topic: TopicSummary) -> tuple[dict[str, Any], str]:
+def camera_of_topic(found: Survey, topic: TopicSummary) -> tuple[dict[str, Any], str]:
     """Return the numbers of the camera of a topic, by the CameraInfo of its frame, or else the only one, and why."""
     infos = [each for each in found.topics if each.offers.camera is not None and each.count]
     mine = [each for each in infos if each.frame == topic.frame] or infos

@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.bags.first_words import GUESS
 from kalmark.bags.survey import Poses, Survey, TopicSummary, yaw
-from kalmark.logs.geodesy import local
+from kalmark.logs.geodesy import to_tangent_plane
 
 NEAR_NS = 500_000_000
 LEAST_WAY_M = 2.0
@@ -48,12 +48,12 @@ def start_of(found: Survey, control: Any, used: Mapping[str, tuple[dict[str, Any
         first = fix.poses.frames[0]
         at = [float(first[0]), float(first[1]), yaw(first)]
         return Start(at, sigmas, f"{GUESS} the first pose of {fix.name}")
-    if (laid := aligned(poses, fix)) is not None:
+    if (laid := align_odometry(poses, fix)) is not None:
         return Start(*laid, f"{GUESS} the way by odometry laid upon that by {fix.name}", north=True)
     return Start([0.0] * 3, [5.0, 1.5], f"{GUESS} its heading, from east to the left", north=True, known=False)
 
 
-def aligned(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], list[float]] | None:
+def align_odometry(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], list[float]] | None:
     """Return the start (x, y, heading) that lays a way by odometry upon satellite fixes, and its sigmas.
 
     By least squares; None where they have too little way in common.
@@ -62,7 +62,7 @@ def aligned(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], list[flo
         return None
     t_ns, frames = np.array(odometry.t_ns), np.array(odometry.frames)
     lla = np.array([frame[:3] for frame in fixes.poses.frames])
-    enu = local(lla, fixes.origin)[:, :2]
+    enu = to_tangent_plane(lla, fixes.origin)[:, :2]
     after = np.clip(np.searchsorted(t_ns, fixes.poses.t_ns), 1, len(t_ns) - 1)
     near = np.abs(t_ns[after] - np.array(fixes.poses.t_ns)) < NEAR_NS
     p, q = frames[after[near], :2], enu[near]

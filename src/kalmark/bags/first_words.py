@@ -11,35 +11,35 @@ from kalmark.bags.survey import TopicSummary
 GUESS = "GUESS:"
 
 
-def quoted(text: str) -> str:
+def yaml_text(text: str) -> str:
     """Return a text as YAML has it."""
     plain = text and text[0].isalpha() | (text[0] in "/_") and all(c.isalnum() or c in "/_-." for c in text)
     return text if plain and text not in ("true", "false", "null", "yes", "no", "on", "off") else f"'{text}'"
 
 
-def number(value: float) -> str:
+def yaml_number(value: float) -> str:
     """Return a number with as many digits as mean something here."""
     return f"{value:.6g}"
 
 
-def mapping(values: dict[str, Any]) -> str:
+def yaml_mapping(values: dict[str, Any]) -> str:
     """Return a mapping on one line of YAML."""
     parts = []
     for key, value in values.items():
         if isinstance(value, dict):
-            text = mapping(value)
+            text = yaml_mapping(value)
         elif isinstance(value, list | tuple):
             text = f"[{', '.join(v if isinstance(v, str) else repr(float(v)) for v in value)}]"
         elif value is None:
             text = "null"
         else:
-            words = quoted(value) if isinstance(value, str) else str(value)
-            text = number(value) if isinstance(value, float) else words
+            words = yaml_text(value) if isinstance(value, str) else str(value)
+            text = yaml_number(value) if isinstance(value, float) else words
         parts.append(f"{key}: {text}")
     return f"{{{', '.join(parts)}}}"
 
 
-def told(topic: TopicSummary) -> str:
+def topic_text(topic: TopicSummary) -> str:
     """Return a topic in words."""
     rate = f", {topic.rate_hz:.3g} Hz" if math.isfinite(topic.rate_hz) else ""
     frames = f", {topic.frames}" if topic.frames else ""

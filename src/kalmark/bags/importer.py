@@ -22,7 +22,7 @@ from kalmark.bags.messages import (
     Pose,
     Seen,
 )
-from kalmark.bags.opening import Bag, Received, declared, find_bag, has_header, stamp
+from kalmark.bags.opening import Bag, Received, find_bag, has_header, header_time, refuse_undeclared_fields
 from kalmark.bags.state_topics import Gathered, OwnReadings
 from kalmark.bags.tf_mounts import Mounts
 from kalmark.bags.topics import (
@@ -41,14 +41,14 @@ from kalmark.bags.topics import (
 )
 from kalmark.declare import Values
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Fix, Frame, Scan, order
+from kalmark.events import Control, Fix, Frame, Scan, sort_key
 from kalmark.geometry import rotations
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
-from kalmark.logs.geodesy import fault, local
+from kalmark.logs.geodesy import fault, to_tangent_plane
 from kalmark.logs.image_files import Forward
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.source import Format, Request, seconds
+from kalmark.logs.source import Format, Request, seconds_text
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import BEAM, POSE3, POSITION
 
@@ -119,7 +119,7 @@ class _Importer:
         return Log(
             name=self.bag.path.name.partition(".")[0], format="bag", path=self.bag.path,
             robots=tuple(robot for robot in robots if any(event.robot == robot for event in self.out.events)),
-            events=sorted(self.out.events, key=order), skipped=self.request.skipped,
+            events=sorted(self.out.events, key=sort_key), skipped=self.request.skipped,
             truth={robot: Trajectory.of(path) for robot, path in self.paths.items()},
             gps={robot: PositionTrack(np.array([*at]), np.array([*at.values()]), np.zeros(2))
                  for robot, at in self.positions.items()},
@@ -147,10 +147,10 @@ class _Importer:
             self.out.left_out[received.topic, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
             return
         try:
-            with declared():
+            with refuse_undeclared_fields():
                 self.taken(received, topic, offer, t_ns)
         except (Refused, EventError) as refused:
-            at = f"{received.topic} at t={seconds(t_ns)} s"
+            at = f"{received.topic} at t={seconds_text(t_ns)} s"
             self.request.refuse(f"{self.bag.path}: {at}: {refused}")
 
     def taken(self, received: Received, topic: Topic, offer: Message, t_ns: int) -> None:
@@ -178,12 +178,12 @@ class _Importer:
         Raises LogError if headers and the recorder have different clocks.
         """
         own = has_header(received.message) and topic.time != "recorded"
-        if own and topic.time == "auto" and stamp(received.message) == 0:
+        if own and topic.time == "auto" and header_time(received.message) == 0:
             return None
         if topic.time == "header" and not own:
             what = f"topic {received.topic}: messages of the type {short(received.type)} have no header"
             raise LogError(f"{self.bag.path}: {what}, expected `time: recorded`")
-        t_ns = stamp(received.message) if own else received.recorded_ns
+        t_ns = header_time(received.message) if own else received.recorded_ns
         first = self.clocks.setdefault(own, (received.topic, t_ns))
         other = self.clocks.get(not own)
         if other is not None and abs(first[1] - other[1]) > DAY_NS:
@@ -213,7 +213,7 @@ class _Importer:
         if isinstance(topic, Fixes):
             self.fix(topic, t_ns, pose.frame[:3], None if pose.cov is None else pose.cov[:3, :3])
         elif isinstance(topic, Truths):
-            own = pose.frame if self.in_space(topic.robot) else in_plane(pose.frame)
+            own = pose.frame if self.in_space(topic.robot) else pose_in_plane(pose.frame)
             self.kept(self.paths, received, topic.robot, t_ns, own)
         else:
             self.moved(received, topic, offer, pose, t_ns)
@@ -245,7 +245,7 @@ class _Importer:
     def step(self, topic: Topic, a: Array, b: Array) -> Array:
         """Return the control that leads from the pose a (7,) to b: an increment of the plane or of space."""
         if not self.in_space(topic.robot):
-            return increment(in_plane(a), in_plane(b))
+            return relative_pose(pose_in_plane(a), pose_in_plane(b))
         step = compose(inverse(a)[0], b)[0]
         return np.append(step[:3], rotations.log(step[3:]))
 
@@ -288,7 +288,7 @@ class _Importer:
             raise Refused(wrong)
         lla = np.where(np.isfinite(place.lla), place.lla, 0.0)  # a fix in two dimensions has no height
         origin = self.origins.setdefault("", lla if topic.origin is None else np.array(topic.origin, dtype=np.float64))
-        enu = local(lla, origin)
+        enu = to_tangent_plane(lla, origin)
         if isinstance(topic, Fixes):
             self.fix(topic, t_ns, enu, place.cov)
         else:
@@ -407,13 +407,13 @@ def images_of(path: Path, name: str) -> Iterator[Any]:
                 yield error
 
 
-def in_plane(frame: Array) -> Array:
+def pose_in_plane(frame: Array) -> Array:
     """Return x, y and yaw (3,) of a frame (7,)."""
     x, y, z, w = frame[3:]
     return np.array([frame[0], frame[1], np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])
 
 
-def increment(a: Array, b: Array) -> Array:
+def relative_pose(a: Array, b: Array) -> Array:
     """Return the pose b (3,) in the frame of a: the way between them."""
     c, s = np.cos(a[2]), np.sin(a[2])
     x, y = b[:2] - a[:2]

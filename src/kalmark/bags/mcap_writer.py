@@ -70,12 +70,12 @@ class Types:
         return [self._value(detail[0], each) for each in value or ()]
 
 
-def header(t_ns: int, frame: str = "") -> dict[str, Any]:
+def header_fields(t_ns: int, frame: str = "") -> dict[str, Any]:
     """Return the fields of a std_msgs/Header; a time that it cannot hold is the nearest that it can."""
-    return {"stamp": stamp(t_ns), "frame_id": frame}
+    return {"stamp": time_fields(t_ns), "frame_id": frame}
 
 
-def stamp(t_ns: int) -> dict[str, int]:
+def time_fields(t_ns: int) -> dict[str, int]:
     """Return the fields of a builtin_interfaces/Time."""
     sec, nanosec = divmod(t_ns, SECOND_NS)
     return {"sec": max(-LATEST_S - 1, min(sec, LATEST_S)), "nanosec": nanosec}

@@ -141,14 +141,14 @@ def pose_frame(pose: Any) -> Array:
     return np.array([pose.position.x, pose.position.y, pose.position.z, *[np.nan] * 4])
 
 
-def covariance(values: Any, size: int = 6) -> Array:
+def covariance_of_values(values: Any, size: int = 6) -> Array:
     """Return a covariance (size, size) of a message, which holds it row by row."""
     return np.array(values, dtype=np.float64).reshape(size, size)
 
 
 def odometry_pose(m: Any) -> Pose:
     """Return the pose of a nav_msgs/Odometry."""
-    return Pose(pose_frame(m.pose.pose), covariance(m.pose.covariance), m.header.frame_id, m.child_frame_id)
+    return Pose(pose_frame(m.pose.pose), covariance_of_values(m.pose.covariance), m.header.frame_id, m.child_frame_id)
 
 
 def stamped_pose(m: Any) -> Pose:
@@ -158,13 +158,13 @@ def stamped_pose(m: Any) -> Pose:
 
 def stamped_pose_with_covariance(m: Any) -> Pose:
     """Return that of a geometry_msgs/PoseWithCovarianceStamped."""
-    return Pose(pose_frame(m.pose.pose), covariance(m.pose.covariance), m.header.frame_id, "")
+    return Pose(pose_frame(m.pose.pose), covariance_of_values(m.pose.covariance), m.header.frame_id, "")
 
 
 def velocity(twist: Any, cov: Any = None) -> Twist:
     """Return a geometry_msgs/Twist."""
     v = np.array([getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"])
-    return Twist(v, None if cov is None else covariance(cov))
+    return Twist(v, None if cov is None else covariance_of_values(cov))
 
 
 def drive(m: Any) -> Array:
@@ -176,7 +176,7 @@ def satellite_fix(m: Any) -> Place | None:
     """Return the position of a sensor_msgs/NavSatFix, None where the receiver has none."""
     if m.status.status < NO_FIX:
         return None
-    cov = covariance(m.position_covariance, 3) if m.position_covariance_type != UNKNOWN_COVARIANCE else None
+    cov = covariance_of_values(m.position_covariance, 3) if m.position_covariance_type != UNKNOWN_COVARIANCE else None
     return Place(np.array([m.latitude, m.longitude, m.altitude]), cov)
 
 
@@ -187,7 +187,7 @@ def vector(v: Any, cov: Any) -> Measured | None:
     """
     if cov[0] == NOT_MEASURED:
         return None
-    told = covariance(cov, 3)
+    told = covariance_of_values(cov, 3)
     return Measured(np.array([v.x, v.y, v.z], dtype=np.float64), told if told.any() else None)
 
 
@@ -321,7 +321,7 @@ def cloud(m: Any, scan: Scans) -> Seen:
     return seen
 
 
-def named(scan: Scans, *names: Any) -> Any:
+def first_id(scan: Scans, *names: Any) -> Any:
     """Return the first id that there is, as a number where it is one; None if the configuration wants none."""
     text = next((str(name) for name in names if str(name)), "") if scan.ids != "none" else ""
     digits = text.removeprefix("-")
@@ -338,7 +338,7 @@ def _of_class(results: Any) -> str:
 def detection_id(each: Any, scan: Scans) -> Any:
     """Return the id of a vision_msgs detection: its own, or else its likeliest class; `ids: class` takes the class."""
     own = getattr(each, "id", getattr(each, "tracking_id", ""))
-    return named(scan, "" if scan.ids == "class" else own, _of_class(each.results))
+    return first_id(scan, "" if scan.ids == "class" else own, _of_class(each.results))
 
 
 def boxes(m: Any, scan: Scans) -> Seen:
@@ -367,7 +367,7 @@ def markers(listed: Iterable[Any], scan: Scans) -> Seen:
         if each.action >= DELETED:
             seen.left_out["markers that are deleted"] += 1
             continue
-        seen.add(pose_frame(each.pose).tolist(), named(scan, f"{each.ns}/{each.id}" if several else each.id))
+        seen.add(pose_frame(each.pose).tolist(), first_id(scan, f"{each.ns}/{each.id}" if several else each.id))
     return seen
 
 

@@ -12,9 +12,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
 from kalmark.errors import LogError
-from kalmark.events import shown
-from kalmark.files import unpacked
-from kalmark.logs.source import nearest
+from kalmark.events import short_text
+from kalmark.files import unpack_file
+from kalmark.logs.source import spelling_hint
 from kalmark.logs.table import Refused
 
 ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
@@ -114,7 +114,8 @@ class Bag:
             except Exception as error:  # rosbags has no common error of texts that are no definitions
                 reason = " ".join(str(error).split())[:120]
                 raise LogError(
-                    f"log option definitions: {kind} is {shown(given)}, expected a .msg file or its text ({reason})"
+                    f"log option definitions: {kind} is {short_text(given)}, "
+                    f"expected a .msg file or its text ({reason})"
                 ) from None
             known.register({each: fields for each, fields in made.items() if each not in known.fielddefs})
         if self._given:  # what these are made of
@@ -131,7 +132,7 @@ class Bag:
             return self.path
         bag = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kalmark-"))) / self.path.stem
         with bag.open("wb") as plain:
-            plain.writelines(unpacked(self.path, LogError))
+            plain.writelines(unpack_file(self.path, LogError))
         return bag
 
     def _damaged(self, error: Exception) -> LogError:
@@ -146,7 +147,7 @@ class Bag:
         if name in self.topics or same:
             return name if name in self.topics else same[0]
         known = ", ".join(sorted(self.topics)) or "one of a bag that is not empty"
-        raise LogError(f"{self.path}: no topic {shown(name)}, expected {known}{nearest(name, self.topics)}")
+        raise LogError(f"{self.path}: no topic {short_text(name)}, expected {known}{spelling_hint(name, self.topics)}")
 
     def times(self) -> Iterator[tuple[str, int]]:
         """Yield topic and time (ns) of all messages as recorded, without reading them.  Raises LogError."""
@@ -180,7 +181,7 @@ class Bag:
             yield received
 
 
-def stamp(message: Any) -> int:
+def header_time(message: Any) -> int:
     """Return the time (ns) in a message's header."""
     return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
 
@@ -199,7 +200,7 @@ def frame_id(message: Any) -> str:
 
 
 @contextmanager
-def declared() -> Iterator[None]:
+def refuse_undeclared_fields() -> Iterator[None]:
     """Raise Refused where a field is read that the bag's definition of a message does not have."""
     try:
         yield

@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.bags import tables, view
-from kalmark.bags.mcap_writer import Outgoing, header, write_mcap
+from kalmark.bags.mcap_writer import Outgoing, header_fields, write_mcap
 from kalmark.geometry.named_poses import pose_of
 from kalmark.geometry.rotations import matrix
 from kalmark.results.history import MapSnapshot
@@ -29,7 +29,7 @@ TAG_M = 0.2  # how large a tag is drawn: its size is not in the map
 
 def export(path: Path, log: Log | None, run: Run | None = None) -> dict[str, int]:
     """Write a log, and the run made of it, into one MCAP file; return the number of messages by topic."""
-    streams = [] if log is None else [tables.messages(log), view.messages(log)]
+    streams = [] if log is None else [tables.messages_of_log(log), view.view_messages(log)]
     streams += [] if run is None else [*run_messages(run)]
     return write_mcap(path, merge(*streams, key=lambda message: message.t_ns))
 
@@ -37,11 +37,11 @@ def export(path: Path, log: Log | None, run: Run | None = None) -> dict[str, int
 def run_messages(run: Run) -> list[Iterator[Outgoing]]:
     """Return the messages of a run as streams, each in order of time."""
     begin = int(run.history.t_ns[0]) if len(run.history.t_ns) else 0
-    robots = [stream(run, robot) for robot in run.history.robots for stream in (poses, paths)]
-    return [iter(mounts(run, begin)), *robots, maps(run), iter([summary(run)] if run.summary else [])]
+    robots = [stream(run, robot) for robot in run.history.robots for stream in (pose_messages, paths)]
+    return [iter(mount_frames(run, begin)), *robots, maps(run), iter([summary_message(run)] if run.summary else [])]
 
 
-def poses(run: Run, robot: str) -> Iterator[Outgoing]:
+def pose_messages(run: Run, robot: str) -> Iterator[Outgoing]:
     """Yield a robot's pose with its covariance after each of its scans: Odometry, tf and diagnostics."""
     history = run.history
     for step in np.flatnonzero(history.robot == robot).tolist():
@@ -49,10 +49,10 @@ def poses(run: Run, robot: str) -> Iterator[Outgoing]:
         mean, dof = mean[~np.isnan(mean)], 3 if np.isnan(mean[3:]).all() else 6
         pose = mean[:3] if dof == 3 else mean[:7]
         twist = {"twist": body_twist(mean)} if len(mean) == FULL else {}
-        fields = {"header": header(t_ns, view.MAP), "child_frame_id": robot, "twist": twist}
+        fields = {"header": header_fields(t_ns, view.MAP), "child_frame_id": robot, "twist": twist}
         fields["pose"] = {"pose": view.pose_fields(pose), "covariance": view.covariance_fields(P[:dof, :dof])}
         yield Outgoing(view.topic(robot, "odometry"), "nav_msgs/msg/Odometry", t_ns, fields)
-        yield tf("/tf", t_ns, [view.transform(t_ns, view.MAP, robot, pose)])
+        yield tf("/tf", t_ns, [view.transform_fields(t_ns, view.MAP, robot, pose)])
         yield diagnostics(t_ns, [status(run, robot, step, P[:dof, :dof])])
 
 
@@ -76,12 +76,12 @@ def paths(run: Run, robot: str) -> Iterator[Outgoing]:
         yield Outgoing(view.topic(robot, "path"), "nav_msgs/msg/Path", t_ns[end - 1], fields)
 
 
-def mounts(run: Run, t_ns: int) -> list[Outgoing]:
+def mount_frames(run: Run, t_ns: int) -> list[Outgoing]:
     """Return the frames of the sensors as configured, in those of their robots."""
     robots, frames = run.config.get("robots") or {}, []
     for robot in run.history.robots:
         for sensor, section in ((robots.get(robot) or robots.get("each") or {}).get("sensors") or {}).items():
-            frames.append(view.transform(t_ns, robot, f"{robot}/{sensor}", pose_of(section.get("mount") or {})))
+            frames.append(view.transform_fields(t_ns, robot, f"{robot}/{sensor}", pose_of(section.get("mount") or {})))
     return [tf("/tf_static", t_ns, frames)] if frames else []
 
 
@@ -89,7 +89,9 @@ def maps(run: Run) -> Iterator[Outgoing]:
     """Yield the map at the instants at which it was kept: ellipsoids of 3 sigma, lines, tags, ids."""
     for kept in run.history.maps:
         rows = landmark_markers(kept)
-        yield Outgoing("/landmarks", "visualization_msgs/msg/MarkerArray", kept.t_ns, view.markers(kept.t_ns, rows))
+        yield Outgoing(
+            "/landmarks", "visualization_msgs/msg/MarkerArray", kept.t_ns, view.marker_array(kept.t_ns, rows)
+        )
 
 
 def landmark_markers(kept: MapSnapshot) -> list[dict[str, Any]]:
@@ -131,7 +133,7 @@ def status(run: Run, robot: str, step: int, P: Array) -> dict[str, Any]:
     return {"level": (WARN if rejected else OK)[0], "name": f"kalmark/{robot}", "message": told, "values": pairs}
 
 
-def summary(run: Run) -> Outgoing:
+def summary_message(run: Run) -> Outgoing:
     """Return the figures and warnings of a run as its last diagnostics."""
     warnings = [str(line) for line in run.summary.get("warnings", ())]
     plain = {key: value for key, value in run.summary.items() if isinstance(value, int | float | str)}
@@ -144,5 +146,5 @@ def summary(run: Run) -> Outgoing:
 
 def diagnostics(t_ns: int, told: list[dict[str, Any]]) -> Outgoing:
     """Return a message of diagnostics."""
-    fields = {"header": header(t_ns), "status": told}
+    fields = {"header": header_fields(t_ns), "status": told}
     return Outgoing("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", t_ns, fields)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.fields import offers, recognised
+from kalmark.bags.fields import landmark_fields, offers
 from kalmark.bags.messages import MESSAGES, Measured, Message, Pose
-from kalmark.bags.opening import UNDEFINED, Bag, declared, frame_id, has_header, stamp
+from kalmark.bags.opening import UNDEFINED, Bag, frame_id, has_header, header_time, refuse_undeclared_fields
 from kalmark.bags.tables import holds_log
 from kalmark.bags.tf_frames import Frames
 from kalmark.bags.topics import Scans
@@ -130,7 +130,7 @@ def survey(path: Path, definitions: Mapping[str, str] | None = None) -> Survey:
         for received in bag.messages(known):
             summary, m = summaries[received.topic], received.message
             own = has_header(m)
-            t_ns = stamp(m) if own else received.recorded_ns
+            t_ns = header_time(m) if own else received.recorded_ns
             if own and not summary.frame:
                 summary.frame, summary.child = frame_id(m), getattr(m, "child_frame_id", "")
             if own and t_ns == 0:
@@ -142,7 +142,7 @@ def survey(path: Path, definitions: Mapping[str, str] | None = None) -> Survey:
                 summary.back_s = max(summary.back_s, (summary.latest_ns - t_ns) * 1e-9)
                 summary.latest_ns = max(summary.latest_ns, t_ns)
             try:
-                with declared():
+                with refuse_undeclared_fields():
                     _look(summary, m, t_ns)
                     transforms = summary.offers.transforms(m) if summary.offers.transforms is not None else []
                 frames.take(transforms)
@@ -161,7 +161,7 @@ def _summary(bag: Bag, name: str) -> TopicSummary:
     known = offers(kind, bag.definitions) or Message("")
     if kind not in bag.definitions:
         return TopicSummary(name, kind, count, error=f"of a type {UNDEFINED}")
-    stated = {} if kind in MESSAGES else recognised(kind, bag.definitions)
+    stated = {} if kind in MESSAGES else landmark_fields(kind, bag.definitions)
     return TopicSummary(name, kind, count, known.what, known, stated=stated)
 
 

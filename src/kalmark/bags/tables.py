@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.mcap_writer import RECORD, Outgoing, header
+from kalmark.bags.mcap_writer import RECORD, Outgoing, header_fields
 from kalmark.bags.opening import Bag, Received
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, order, when
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, label_of_event, sort_key
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.native_writer import id_text
 from kalmark.logs.source import Request, landmark_id
@@ -47,7 +47,7 @@ def holds_log(bag: Bag) -> bool:
 
 
 # ------------------------------------------------------------------ to messages
-def messages(log: Log) -> Iterator[Outgoing]:
+def messages_of_log(log: Log) -> Iterator[Outgoing]:
     """Yield the messages that hold a log, in order of time."""
     begin = log.events[0].t_ns if log.events else 0
     about = {
@@ -59,8 +59,12 @@ def messages(log: Log) -> Iterator[Outgoing]:
     }
     yield Outgoing(LOG, "std_msgs/msg/String", begin, {"data": json.dumps(about, default=_plain)})
     for id_, place in log.landmarks.items():
-        yield record(LANDMARKS, begin, "", values=place, ids=[id_text(id_)])
-    streams = [map(of_event(log), log.events), *map(poses, log.truth.items()), *map(fixes, log.gps.items())]
+        yield record_message(LANDMARKS, begin, "", values=place, ids=[id_text(id_)])
+    streams = [
+        map(message_function(log), log.events),
+        *map(pose_records, log.truth.items()),
+        *map(fix_records, log.gps.items()),
+    ]
     yield from merge(*streams, key=lambda message: message.t_ns)
 
 
@@ -69,46 +73,54 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else np.asarray(value).tolist()
 
 
-def record(
+def record_message(
     topic: str, t_ns: int, robot: str, values: Any, sensor: str = "", columns: Any = (), ids: Any = (), cov: Any = None
 ) -> Outgoing:
     """Return one kalmark_msgs/Record."""
-    fields = {"header": header(t_ns, robot), "t_ns": t_ns, "robot": robot, "sensor": sensor, "columns": list(columns)}
+    fields = {
+        "header": header_fields(t_ns, robot),
+        "t_ns": t_ns,
+        "robot": robot,
+        "sensor": sensor,
+        "columns": list(columns),
+    }
     fields |= {"ids": list(ids), "values": values, "covariance": () if cov is None else cov}
     return Outgoing(topic, RECORD, t_ns, fields)
 
 
-def of_event(log: Log) -> Any:
+def message_function(log: Log) -> Any:
     """Return the function that makes an event a message."""
 
     def made(event: Event) -> Outgoing:
         if isinstance(event, Control):
             columns = log.control_columns.get(event.robot, ())
-            return record(CONTROLS, event.t_ns, event.robot, event.u, columns=columns, cov=event.cov)
+            return record_message(CONTROLS, event.t_ns, event.robot, event.u, columns=columns, cov=event.cov)
         if isinstance(event, Fix):
-            return record(FIXES, event.t_ns, event.robot, event.y, columns=POSITION[: len(event.y)], cov=event.cov)
+            return record_message(
+                FIXES, event.t_ns, event.robot, event.y, columns=POSITION[: len(event.y)], cov=event.cov
+            )
         if isinstance(event, Frame):
-            raise LogError(f"{when(event)}: an image, expected controls, scans and fixes")
+            raise LogError(f"{label_of_event(event)}: an image, expected controls, scans and fixes")
         columns = log.sensor_columns.get((event.robot, event.sensor), ())
         ids = ["" if id_ is None else id_text(id_) for id_ in event.ids or ()]
-        return record(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov)
+        return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov)
 
     return made
 
 
-def poses(item: tuple[str, Trajectory]) -> Iterator[Outgoing]:
+def pose_records(item: tuple[str, Trajectory]) -> Iterator[Outgoing]:
     """Yield the true poses of one robot."""
     robot, path = item
     columns = POSE2 if path.poses.shape[1] == 3 else POSE3
     for t_ns, pose in zip(path.t_ns.tolist(), path.poses, strict=True):
-        yield record(TRUTH, t_ns, robot, pose, columns=columns)
+        yield record_message(TRUTH, t_ns, robot, pose, columns=columns)
 
 
-def fixes(item: tuple[str, PositionTrack]) -> Iterator[Outgoing]:
+def fix_records(item: tuple[str, PositionTrack]) -> Iterator[Outgoing]:
     """Yield the positions of one robot that only score."""
     robot, track = item
     for t_ns, xy in zip(track.t_ns.tolist(), track.xy, strict=True):
-        yield record(GPS, t_ns, robot, [*xy, *track.antenna], columns=GPS_COLUMNS)
+        yield record_message(GPS, t_ns, robot, [*xy, *track.antenna], columns=GPS_COLUMNS)
 
 
 # ------------------------------------------------------------------ and back
@@ -132,13 +144,13 @@ def read(bag: Bag, request: Request) -> Log:
             elif topic == GPS:
                 gps.setdefault(m.robot, []).append((int(m.t_ns), np.array(m.values)))
             else:
-                events.append(event_of(received))
+                events.append(event_of_message(received))
         except (EventError, ValueError, IndexError, AttributeError) as error:
             request.refuse(f"{bag.path}: {topic} recorded at {received.recorded_ns} ns: {error}")
     try:
         return Log(
             name=about["name"], format="bag", path=bag.path, robots=tuple(about["robots"]),
-            events=sorted(events, key=order), skipped=request.skipped, landmarks=landmarks,
+            events=sorted(events, key=sort_key), skipped=request.skipped, landmarks=landmarks,
             truth={robot: Trajectory.of(p) for robot, p in truth.items()},
             gps={robot: _track(rows) for robot, rows in gps.items()},
             control_columns={robot: tuple(columns) for robot, columns in about["control_columns"].items()},
@@ -149,7 +161,7 @@ def read(bag: Bag, request: Request) -> Log:
         raise LogError(f"{bag.path}: topic {LOG} is damaged ({error!r}), expected what kalmark wrote") from None
 
 
-def event_of(received: Received) -> Event:
+def event_of_message(received: Received) -> Event:
     """Return the event of a message.  Raises EventError, ValueError."""
     m, n = received.message, len(received.message.values)
     cov = np.array(m.covariance) if len(m.covariance) else None

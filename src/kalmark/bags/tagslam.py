@@ -16,10 +16,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.opening import Bag, stamp
+from kalmark.bags.opening import Bag, header_time
 from kalmark.declare import Within
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, order, unit_quaternion
+from kalmark.events import Control, Event, Id, Scan, sort_key, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.rotations import matrix
@@ -30,9 +30,9 @@ from kalmark.logs.source import (
     Format,
     Request,
     folder_of,
-    mapping,
-    nanoseconds,
+    nanoseconds_of_text,
     one_robot,
+    read_mapping,
     vector_frame,
 )
 from kalmark.logs.table_columns import CORNERS, INCREMENT3
@@ -91,7 +91,7 @@ class Scene:
 
 def read_scene(path: Path) -> Scene:
     """Return the scene in tagslam.yaml.  Raises LogError if something in it is not as TagSLAM wants it."""
-    content = mapping(path)
+    content = read_mapping(path)
     try:
         scene = Scene(default_body=content.get("default_body", ""))
         scene.pixel_noise = float(content.get("tagslam_parameters", {}).get("pixel_noise", 1.0))
@@ -99,7 +99,7 @@ def read_scene(path: Path) -> Scene:
             for name, body in entry.items():
                 add_body(scene, name, body)
         for entry in content.get("squash", []):
-            t_ns = nanoseconds(str(entry["time"]))
+            t_ns = nanoseconds_of_text(str(entry["time"]))
             scene.squashed.update((t_ns, int(tag)) for tag in entry["tags"])
     except KeyError as error:
         raise LogError(f"{path}: no {error.args[0]!r} where it is needed, expected a file of TagSLAM") from None
@@ -136,8 +136,8 @@ def frame_of(pose: dict[str, Any]) -> Array:
 def read_cameras(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """Return the cameras of cameras.yaml, and the poses in their body of those in camera_poses.yaml."""
     path = folder / "cameras.yaml"
-    cameras, poses_path = mapping(path), folder / "camera_poses.yaml"
-    poses = mapping(poses_path) if poses_path.is_file() else {}
+    cameras, poses_path = read_mapping(path), folder / "camera_poses.yaml"
+    poses = read_mapping(poses_path) if poses_path.is_file() else {}
     for name, camera in cameras.items():
         for key in ("intrinsics", "distortion_model", "distortion_coeffs", "resolution", "tagtopic", "rig_body"):
             if key not in camera:
@@ -162,7 +162,7 @@ def described_camera(camera: dict[str, Any], mount: dict[str, float], pixel_nois
 
 
 # ------------------------------------------------------------------ the survey
-def surveyed(path: Path, exact: bool = False) -> list[KnownLandmark]:
+def surveyed_tags(path: Path, exact: bool = False) -> list[KnownLandmark]:
     """Return the tags of a tagslam.yaml that have a pose on a static body with a pose, as a known map.
 
     Their covariances (6, 6) are those of `position_noise` (m) and `rotation_noise` (rad), standard deviations along and
@@ -171,10 +171,13 @@ def surveyed(path: Path, exact: bool = False) -> list[KnownLandmark]:
     """
     read_scene(path)
     try:
-        bodies = [body for entry in mapping(path)["bodies"] for body in entry.values()]
+        bodies = [body for entry in read_mapping(path)["bodies"] for body in entry.values()]
         placed = [(b["pose"], tag) for b in bodies if b["is_static"] and "pose" in b for tag in b.get("tags", [])]
-        tags = [(int(tag["id"]), frame_of(b), noise_of(b), frame_of(tag["pose"]), noise_of(tag["pose"]))
-                for b, tag in placed if "pose" in tag]  # fmt: skip
+        tags = [
+            (int(tag["id"]), frame_of(b), covariance_of_pose(b), frame_of(tag["pose"]), covariance_of_pose(tag["pose"]))
+            for b, tag in placed
+            if "pose" in tag
+        ]
     except (KeyError, TypeError, ValueError) as error:
         raise LogError(f"{path}: {error!r}, expected poses with position and rotation") from None
     if not tags:
@@ -187,7 +190,7 @@ def surveyed(path: Path, exact: bool = False) -> list[KnownLandmark]:
     return found
 
 
-def noise_of(pose: dict[str, Any]) -> Array:
+def covariance_of_pose(pose: dict[str, Any]) -> Array:
     """Return the covariance (6, 6) of a pose as TagSLAM writes it, of errors in the frame that it is in."""
     none = dict.fromkeys("xyz", 0.0)
     sigmas = [[float(pose.get(f"{part}_noise", none)[axis]) for axis in "xyz"] for part in ("position", "rotation")]
@@ -210,7 +213,7 @@ def find_bag(folder: Path, name: str) -> Path | None:
     return None
 
 
-def messages(path: Path) -> list[tuple[str, Any]]:
+def messages_of_bag(path: Path) -> list[tuple[str, Any]]:
     """Return (topic, message) of everything in a bag, as recorded.  Raises LogError if it cannot be read."""
     with Bag(path) as bag:
         return [(received.topic, received.message) for received in bag.messages(bag.topics)]
@@ -243,15 +246,15 @@ def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
     moving = rig if world == "map" else world
     last: dict[tuple[str, str], Array] = {("map", "map"): HERE}
     track: list[tuple[int, Array]] = []
-    for topic, message in messages(bag):
+    for topic, message in messages_of_bag(bag):
         if topic == f"/tagslam/odom/body_{moving}":
-            track.append((stamp(message), pose_of(message.pose.pose.position, message.pose.pose.orientation)))
+            track.append((header_time(message), pose_of(message.pose.pose.position, message.pose.pose.orientation)))
         elif topic == "/tf":
             for one in message.transforms:
                 pose = pose_of(one.transform.translation, one.transform.rotation)
                 last[one.header.frame_id, one.child_frame_id] = pose
     if world != "map":
-        track = [(t_ns, between(pose, last["map", rig])) for t_ns, pose in track]
+        track = [(t_ns, relative_frame(pose, last["map", rig])) for t_ns, pose in track]
     tags: dict[Id, Array] = {
         int(child.removeprefix("tag_")): pose if parent == world else compose(last["map", parent], pose)[0]
         for (parent, child), pose in last.items()
@@ -262,7 +265,7 @@ def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
     return Reference(path, tags, cameras)
 
 
-def between(a: Array, b: Array) -> Array:
+def relative_frame(a: Array, b: Array) -> Array:
     """Return the frame b in the frame a."""
     return compose(inverse(a)[0], b)[0]
 
@@ -280,7 +283,7 @@ class Odometry(NamedTuple):
 def read_odometry(scene: Scene, received: list[tuple[str, Any]]) -> Odometry | None:
     """Return the odometry of the rig, None if there is none in the bag."""
     for body in scene.odometry.values():
-        rows = [(stamp(m), m.pose.pose) for topic, m in received if topic == body["odom_topic"]]
+        rows = [(header_time(m), m.pose.pose) for topic, m in received if topic == body["odom_topic"]]
         if rows:
             poses = np.array([pose_of(pose.position, pose.orientation) for _, pose in rows])
             sigmas = (float(body.get(f"odom_{what}_noise", SIGMA)) for what in ("translation", "rotation"))
@@ -288,7 +291,7 @@ def read_odometry(scene: Scene, received: list[tuple[str, Any]]) -> Odometry | N
     return None
 
 
-def controls(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
+def rig_increments(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
     """Return the rig's increments between the times of the scans, on the interpolated path.
 
     The odometry's frame O moves by D in its own frame, the rig by T D T^-1.  The noise grows with the time.
@@ -297,7 +300,7 @@ def controls(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
 
     t_ns = np.unique([scan.t_ns for scan in scans])
     rig = [compose(pose, inverse(moved.T)[0])[0] for pose in moved.path.at(t_ns, max_gap_s=1e9)]
-    steps = np.array([between(*pair) for pair in pairwise(rig)]).reshape(-1, 7)
+    steps = np.array([relative_frame(*pair) for pair in pairwise(rig)]).reshape(-1, 7)
     u = np.column_stack([steps[:, :3], Rotation.from_quat(steps[:, 3:]).as_rotvec()])
     N = np.diag(np.square(3 * [moved.sigma_m] + 3 * [moved.sigma_rad]))
     covs = N * (np.diff(t_ns) * 1e-9)[:, None, None]
@@ -317,7 +320,7 @@ def scans_of(
     for topic, message in received:
         if topic.lstrip("/") not in cameras:
             continue
-        t_ns, seen = stamp(message), dict[int, list[float]]()
+        t_ns, seen = header_time(message), dict[int, list[float]]()
         for tag in message.apriltags:
             id_, size = int(tag.id), scene.size(int(tag.id))
             reason = scene.refusal(tag, t_ns)
@@ -331,7 +334,7 @@ def scans_of(
         scans.append(Scan(t_ns=t_ns, robot=ROBOT, sensor=camera, y=[*seen.values()], ids=[*seen]))
     for reason, count in sorted(left_out.items()):
         request.leave_out(count, f"{bag}: {count} {reason}")
-    return sorted(scans, key=order)
+    return sorted(scans, key=sort_key)
 
 
 def read(
@@ -366,12 +369,12 @@ def read(
             sections[name] = described_camera(camera, where, scene.pixel_noise)
         else:
             request.skipped.append(f"{path / 'cameras.yaml'}: {name}, whose pose on the rig is not given")
-    received = messages(bag)
+    received = messages_of_bag(bag)
     topics = {str(known[name]["tagtopic"]).lstrip("/"): name for name in sections}
     scans = scans_of(received, topics, scene, bag, request)
     moved = read_odometry(scene, received) if odometry == "auto" else None
     scans = begin(path, scans, reference, moved, request)
-    events: list[Event] = [*scans, *(controls(moved, scans) if moved else [])]
+    events: list[Event] = [*scans, *(rig_increments(moved, scans) if moved else [])]
     rig = {"robots": {ROBOT: robot(sections, reference, scans, moved)}, "landmarks": {"type": "tag"}}
     truth = {ROBOT: reference.path} if reference.path is not None else {}
     columns = dict.fromkeys(sections, CORNERS)
@@ -420,5 +423,5 @@ TAGSLAM = Format(
     "a folder with tagslam.yaml, cameras.yaml and tag_detections.bag",
     find,
     read,
-    known_maps={".yaml": surveyed, ".yml": surveyed},
+    known_maps={".yaml": surveyed_tags, ".yml": surveyed_tags},
 )

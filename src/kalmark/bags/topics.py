@@ -13,9 +13,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from kalmark.declare import Number, Within, class_of, classes, declared, parameters, refuse, register
 from kalmark.errors import LogError, ModelError
-from kalmark.events import Id, is_number, shown
+from kalmark.events import Id, is_number, short_text
 from kalmark.geometry.named_poses import POSES
-from kalmark.logs.source import landmark_id, nanoseconds, nearest
+from kalmark.logs.source import landmark_id, nanoseconds_of_text, spelling_hint
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 
 
@@ -148,7 +148,7 @@ class Carried(Topic):
 
 
 def _microseconds(time: Any) -> int:
-    return (nanoseconds(str(time)) + 500) // 1000
+    return (nanoseconds_of_text(str(time)) + 500) // 1000
 
 
 def _a_size(value: Any) -> bool:
@@ -315,16 +315,16 @@ def topic_of(name: str, section: Any) -> Topic:
         return section
     where, kinds = f"log option topics: {name}", classes("topic")
     if not isinstance(section, Mapping) or not isinstance(section.get("type"), str):
-        raise LogError(f"{where} is {shown(section)}, expected a mapping with a type: {', '.join(kinds)}")
+        raise LogError(f"{where} is {short_text(section)}, expected a mapping with a type: {', '.join(kinds)}")
     if section["type"] not in kinds:
-        hint = nearest(section["type"], kinds)
+        hint = spelling_hint(section["type"], kinds)
         raise LogError(f"{where}: type is {section['type']!r}, expected one of {', '.join(kinds)}{hint}")
     model = class_of("topic", section["type"])
     given, known = {key: value for key, value in section.items() if key != "type"}, [p.name for p in parameters(model)]
     for key in given:
         if key not in known:
             raise LogError(
-                f"{where}: unknown key {key!r}, expected one of {', '.join(known)}{nearest(str(key), known)}"
+                f"{where}: unknown key {key!r}, expected one of {', '.join(known)}{spelling_hint(str(key), known)}"
             )
     try:
         topic: Topic = model(**given)

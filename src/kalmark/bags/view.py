@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.mcap_writer import Outgoing, header, stamp
+from kalmark.bags.mcap_writer import Outgoing, header_fields, time_fields
 from kalmark.events import Control, Fix
 from kalmark.geometry.rotations import from_matrix
 from kalmark.logs.log import Log
@@ -30,7 +30,7 @@ def topic(robot: str, *names: str) -> str:
     return "/" + "/".join("".join(c if c.isalnum() and c.isascii() else "_" for c in name) for name in (robot, *names))
 
 
-def in_space(pose: Array) -> Array:
+def pose_in_space(pose: Array) -> Array:
     """Return a pose (3,) or (7,) as one of space (7,)."""
     if len(pose) == 7:
         return pose
@@ -40,7 +40,7 @@ def in_space(pose: Array) -> Array:
 
 def pose_fields(pose: Array) -> dict[str, Any]:
     """Return the fields of a geometry_msgs/Pose, of a pose (3,) or (7,)."""
-    x, y, z, *q = in_space(pose).tolist()
+    x, y, z, *q = pose_in_space(pose).tolist()
     return {"position": {"x": x, "y": y, "z": z}, "orientation": dict(zip("xyzw", q, strict=True))}
 
 
@@ -55,8 +55,8 @@ def covariance_fields(cov: Array) -> Array:
 def path_fields(t_ns: Sequence[int], poses: Array) -> dict[str, Any]:
     """Return the fields of a nav_msgs/Path, thinned where it has very many poses."""
     chosen = np.unique(np.linspace(0, len(t_ns) - 1, min(len(t_ns), MOST_POSES)).astype(int)) if len(t_ns) else ()
-    rows = [{"header": header(int(t_ns[k]), MAP), "pose": pose_fields(poses[k])} for k in chosen]
-    return {"header": header(int(t_ns[-1]) if len(t_ns) else 0, MAP), "poses": rows}
+    rows = [{"header": header_fields(int(t_ns[k]), MAP), "pose": pose_fields(poses[k])} for k in chosen]
+    return {"header": header_fields(int(t_ns[-1]) if len(t_ns) else 0, MAP), "poses": rows}
 
 
 def marker(
@@ -71,7 +71,7 @@ def marker(
 ) -> dict[str, Any]:
     """Return the fields of a visualization_msgs/Marker in the map's frame."""
     return {
-        "header": header(t_ns, MAP), "ns": space, "id": number, "type": kind, "pose": at, "text": text,
+        "header": header_fields(t_ns, MAP), "ns": space, "id": number, "type": kind, "pose": at, "text": text,
         "scale": dict(zip("xyz", map(float, scale), strict=True)), "color": dict(zip("rgba", colour, strict=True)),
     }  # fmt: skip
 
@@ -93,26 +93,26 @@ def ellipsoid(mean: Array, cov: Array, sigmas: float = SIGMAS) -> tuple[dict[str
 
 def label(t_ns: int, number: int, text: str, at: Array, colour: Sequence[float]) -> dict[str, Any]:
     """Return a landmark's name, above it."""
-    above = placed(at)
+    above = pose_of_place(at)
     above[2] += LABEL_M
     return marker(t_ns, "ids", number, TEXT, pose_fields(above), (0, 0, LABEL_M), (*colour[:3], 1.0), text)
 
 
-def placed(place: Array) -> Array:
+def pose_of_place(place: Array) -> Array:
     """Return the pose (7,) of a point (2,) or (3,), the first end of a line (6,) or a tag (7,)."""
     if len(place) == 7:
         return place.copy()
     return np.append(np.pad(place[:3], (0, 3 - len(place[:3]))), [0.0, 0, 0, 1])
 
 
-def markers(t_ns: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def marker_array(t_ns: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the fields of a MarkerArray that replaces all markers of its topic."""
-    clear = {"header": header(t_ns, MAP), "action": DELETE_ALL, "pose": {"orientation": {"w": 1.0}}}
+    clear = {"header": header_fields(t_ns, MAP), "action": DELETE_ALL, "pose": {"orientation": {"w": 1.0}}}
     return {"markers": [clear, *rows]}
 
 
 # ------------------------------------------------------------------ a log
-def messages(log: Log) -> Iterator[Outgoing]:
+def view_messages(log: Log) -> Iterator[Outgoing]:
     """Yield what is drawn of a log, in order of time."""
     if not log.events:
         return
@@ -123,26 +123,26 @@ def messages(log: Log) -> Iterator[Outgoing]:
     if log.landmarks:
         rows = []
         for number, (id_, place) in enumerate(log.landmarks.items()):
-            at = pose_fields(placed(place))
+            at = pose_fields(pose_of_place(place))
             rows.append(marker(begin, "truth", number, CUBE, at, (0.1, 0.1, 0.1), TRUTH_COLOUR))
             rows.append(label(begin, number, str(id_), place, TRUTH_COLOUR))
-        yield Outgoing("/truth/landmarks", "visualization_msgs/msg/MarkerArray", begin, markers(begin, rows))
+        yield Outgoing("/truth/landmarks", "visualization_msgs/msg/MarkerArray", begin, marker_array(begin, rows))
     for event in log.events:
         if isinstance(event, Fix):
             cov = covariance_fields(event.cov if len(event.y) == 2 else np.pad(event.cov, (0, 3)))
-            fields = {"pose": pose_fields(placed(event.y)), "covariance": cov}
-            fields = {"header": header(event.t_ns, MAP), "pose": fields}
+            fields = {"pose": pose_fields(pose_of_place(event.y)), "covariance": cov}
+            fields = {"header": header_fields(event.t_ns, MAP), "pose": fields}
             kind = "geometry_msgs/msg/PoseWithCovarianceStamped"
             yield Outgoing(topic(event.robot, "fix"), kind, event.t_ns, fields)
         elif isinstance(event, Control) and log.control_columns.get(event.robot) == ("v_mps", "w_radps"):
             v, w = event.u.tolist()
             twist = {"linear": {"x": v, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": w}}
-            fields = {"header": header(event.t_ns, event.robot), "twist": twist}
+            fields = {"header": header_fields(event.t_ns, event.robot), "twist": twist}
             yield Outgoing(topic(event.robot, "velocity"), "geometry_msgs/msg/TwistStamped", event.t_ns, fields)
 
 
-def transform(t_ns: int, parent: str, child: str, pose: Array) -> dict[str, Any]:
+def transform_fields(t_ns: int, parent: str, child: str, pose: Array) -> dict[str, Any]:
     """Return the fields of a geometry_msgs/TransformStamped."""
     at = pose_fields(pose)
     moved = {"translation": at["position"], "rotation": at["orientation"]}
-    return {"header": {"stamp": stamp(t_ns), "frame_id": parent}, "child_frame_id": child, "transform": moved}
+    return {"header": {"stamp": time_fields(t_ns), "frame_id": parent}, "child_frame_id": child, "transform": moved}

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Index
-from kalmark.compiled import compiled, in_python
+from kalmark.compiled import compiled, python_form
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import wrap
@@ -26,7 +26,7 @@ POSE_SPACES: dict[int, Space] = {3: SE2, 7: SE3}  # by their numbers
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 
 
-def unsolved(what: str) -> KalmarkError:
+def unsolvable_problem(what: str) -> KalmarkError:
     """Return the error of a problem that cannot be stated or solved."""
     return KalmarkError(f"batch solution: {what}")
 
@@ -84,12 +84,12 @@ def plus(space: Space, x: Array, d: Array, turns: Array) -> Array:
     return run(space.atoms, *(np.ascontiguousarray(a) for a in (x, d, turns)))
 
 
-def looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
+def innovations_and_jacobians(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
     """Return the innovations z (K, p) of y (K, m) and E (K, p, h + n) by the errors of head and landmark.  [S] (63).
 
     Row for row a `head` (K, .), pose and mount as of `kalmark.models.observe`, observes a landmark l (K, .).
     """
-    look = _looked if isinstance(view, tuple) else in_python(_looked)
+    look = _looked if isinstance(view, tuple) else python_form(_looked)
     return look(view, *(np.ascontiguousarray(a) for a in (head, l, y)))
 
 
@@ -120,13 +120,13 @@ def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
     return z, E
 
 
-def beyond(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
+def step_residuals(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
     """Return what the poses b after a imply beyond the steps: w (n, q) in the frames a, W (n, q, 2 q) by a and b."""
-    return (_beyond_in_plane if a.shape[1] == 3 else _beyond_in_space)(a, b, step)
+    return (_step_residuals_in_plane if a.shape[1] == 3 else _step_residuals_in_space)(a, b, step)
 
 
 @compiled
-def _beyond_in_plane(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
+def _step_residuals_in_plane(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
     n = len(a)
     w, W = np.empty((n, 3)), np.empty((n, 3, 6))
     for i in range(n):
@@ -143,7 +143,7 @@ def _beyond_in_plane(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def _beyond_in_space(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
+def _step_residuals_in_space(a: Array, b: Array, step: Array) -> tuple[Array, Array]:
     n = len(a)
     w, W = np.empty((n, 6)), np.empty((n, 6, 12))
     for i in range(n):

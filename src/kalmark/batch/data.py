@@ -17,11 +17,11 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, BatchState, Ints, unsolved
+from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, BatchState, Ints, unsolvable_problem
 from kalmark.batch.motion_chain import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
 from kalmark.batch.wall_anchors import anchors
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, when
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, label_of_event
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import mount_space
 from kalmark.models.landmarks import Point2D, Wall2D
@@ -108,7 +108,7 @@ class BatchInput:
         return Point2D() if beside else self.landmark
 
 
-def replayed(given: BatchInput, events: Iterable[Event]) -> Problem:
+def replay_events(given: BatchInput, events: Iterable[Event]) -> Problem:
     """Return the problem of the motion and fixes of `events` and the observations that are associated.
 
     Raises KalmarkError for what cannot be solved for, or if the events are not those of the associations.
@@ -141,7 +141,7 @@ class BatchReplay:
             replay.take(event)
         if len(replay.nodes) < len(given.t_ns):
             t_s = given.t_ns[len(replay.nodes)] * 1e-9
-            raise unsolved(f"the log has no scan at t={t_s:.9g} s, expected the log of the run")
+            raise unsolvable_problem(f"the log has no scan at t={t_s:.9g} s, expected the log of the run")
         return replay
 
     def reassociated(
@@ -198,14 +198,16 @@ class BatchReplay:
             return event if detector is None else detector(event)
         if not isinstance(detector, FrameDetector):
             why = f"{event.sensor!r} searched its images where the filter expected landmarks"
-            raise unsolved(f"{when(event)}: {why}, expected scans, or a detector that searches each image by itself")
+            raise unsolvable_problem(
+                f"{label_of_event(event)}: {why}, expected scans, or a detector that searches each image by itself"
+            )
         return detector.scan_of(event)
 
     def _scan(self, scan: Scan, rows: list[int]) -> None:
         used, node = self.given.associations, self.nodes[-1]
         mount, index = self.given.robots[scan.robot].sensors[scan.sensor], used.index[rows]
         if (used.sensor[rows] != scan.sensor).any() or (index >= len(scan.y)).any():
-            raise unsolved(f"scan at t={scan.t_s:.9g} s is not the one of the run, expected its log")
+            raise unsolvable_problem(f"scan at t={scan.t_s:.9g} s is not the one of the run, expected its log")
         R = self._noise(scan, mount.sensor, rows)
         for row, y, R_row in zip(rows, scan.y[index], R, strict=True):
             target, group = used.landmark[row], LANDMARKS
@@ -227,7 +229,7 @@ class BatchReplay:
             return sensor.noise_at(sensor.invert(e)[0])
         if isinstance(sensor, Ranging):
             return sensor.noise(e)
-        raise unsolved(f"the noise of {type(sensor).__name__} is not additive, expected one that is")
+        raise unsolvable_problem(f"the noise of {type(sensor).__name__} is not additive, expected one that is")
 
     def _varies(self, sensor: Sensor, scan: Scan) -> TypeGuard[NonAdditiveSensor]:
         """Return whether the noise of a scan's sensor varies with the measurement; O(1) after its first scan."""
@@ -280,7 +282,7 @@ class BatchReplay:
         given, kept = self.given, {}
         for (robot, sensor, group), seen in self.sighted.items():
             if given.robots[robot].sensors[sensor].cov is not None and (robot, sensor) not in given.mounts:
-                raise unsolved(f"mount '{robot}.{sensor}' is in the map, expected mounts that are known")
+                raise unsolvable_problem(f"mount '{robot}.{sensor}' is in the map, expected mounts that are known")
             rows = [(*one[:1], at.get(one.target, -1) if group == LANDMARKS else one.target, *one[2:4]) for one in seen]
             columns = [np.array(column) for column in zip(*(row for row in rows if row[1] != -1), strict=True)]
             if columns:
@@ -338,7 +340,7 @@ class BatchReplay:
             if isinstance(self.given.landmark, Wall2D) and mean.shape == (2,):
                 mean = np.append(mean, 0.0)  # a point
             if mean.shape != (size,) or not np.isfinite(mean).all():
-                raise unsolved(
+                raise unsolvable_problem(
                     f"landmark {str(name)!r} is at {mean.tolist()}, expected a point of {size} finite numbers"
                 )
             return mean
@@ -350,7 +352,7 @@ class BatchReplay:
                     seen_as = self.given.seen_by(mount.sensor)
                     place = inverse_expectation(poses[node], at, mount.sensor, seen_as, y[None])[0][0]
                     return np.append(place, np.zeros(self.given.landmark.space.size - len(place)))
-        raise unsolved(f"landmark {str(name)!r} is not in the map, expected a place to start from")
+        raise unsolvable_problem(f"landmark {str(name)!r} is not in the map, expected a place to start from")
 
 
 def _first_poses(seen: list[Factor], n: int, exactly: Flags) -> Ints:

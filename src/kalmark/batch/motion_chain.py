@@ -10,12 +10,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import ORIGIN, Ints, unsolved
+from kalmark.batch.batch_state import ORIGIN, Ints, unsolvable_problem
 from kalmark.batch.problem import Motions, motions
 from kalmark.events import Control
 from kalmark.geometry import frames, frames3d
-from kalmark.models.observe import composed
-from kalmark.models.protocols import Motion, SelfCalibrating, calibrating, true_control
+from kalmark.models.observe import sensor_pose
+from kalmark.models.protocols import Motion, SelfCalibrating, self_calibrating, true_control
 from kalmark.slam.held_control import HeldInput, MotionPart
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class Course:
             self.shared[self.held] = self.shared.get(self.held, 0.0) + R_u @ roots[self.held]
         for D in (self.motion.diffusion(part.u, part.dt_s), part.unknown):
             if D is not None:
-                axes = composed(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
+                axes = sensor_pose(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
                 self.Q[-1] += axes @ D @ axes.T
 
     def _control(self, part: MotionPart) -> Array:
@@ -154,9 +154,9 @@ class Chain:
         for name, robot in robots.items():
             space = robot.motion.space
             if space.size not in ORIGIN:
-                raise unsolved(f"robot {name!r} has {space.size} state coordinates, expected a pose alone")
-            if calibrating(robot.motion) is not None and name not in biases:
-                raise unsolved(f"the bias of {name!r} is in the map, expected controls without one")
+                raise unsolvable_problem(f"robot {name!r} has {space.size} state coordinates, expected a pose alone")
+            if self_calibrating(robot.motion) is not None and name not in biases:
+                raise unsolvable_problem(f"the bias of {name!r} is in the map, expected controls without one")
             mean, P = starts.get(name, (robot.start, np.zeros((space.dof,) * 2) if robot.cov is None else robot.cov))
             course = self.courses[name] = Course(robot, len(self.nodes), biases.get(name))
             course.Q[-1] = P
@@ -218,7 +218,7 @@ class Chain:
             np.array(column) for column in ([x.previous for x in self.nodes], [x.step for x in self.nodes])
         )
         for i in (i for i, node in enumerate(self.nodes) if not node.known and node.previous >= 0):
-            steps[i] = between(poses[previous[i]], poses[i])
+            steps[i] = relative_pose(poses[previous[i]], poses[i])
         return motions(previous, steps, columns.matrix(q * n), columns.kinds, T.reshape(q * n, -1), tuple(errors))
 
     def _kind(self, node: int, kind: str) -> str:
@@ -231,7 +231,9 @@ class Chain:
         poses[nodes] = known
         for i, node in enumerate(self.nodes):
             if np.isnan(poses[i, 0]):
-                poses[i] = composed(ORIGIN[known.shape[1]] if node.previous < 0 else poses[node.previous], node.step)[0]
+                poses[i] = sensor_pose(
+                    ORIGIN[known.shape[1]] if node.previous < 0 else poses[node.previous], node.step
+                )[0]
         return poses
 
 
@@ -258,10 +260,10 @@ class _Columns:
         return sp.csr_array(sp.coo_array((value, (row, column)), shape=(rows, len(self.kinds))))
 
 
-def between(a: Array, b: Array) -> Array:
+def relative_pose(a: Array, b: Array) -> Array:
     """Return the pose b in the frame of a."""
     back = frames.inverse(a) if len(a) == 3 else frames3d.inverse(a)
-    return composed(back[0], b)[0]
+    return sensor_pose(back[0], b)[0]
 
 
 def root(N: Array) -> Array:

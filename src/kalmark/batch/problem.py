@@ -16,7 +16,16 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import ORIGIN, POSE_SPACES, POSES, BatchState, Ints, beyond, looked, plus
+from kalmark.batch.batch_state import (
+    ORIGIN,
+    POSE_SPACES,
+    POSES,
+    BatchState,
+    Ints,
+    innovations_and_jacobians,
+    plus,
+    step_residuals,
+)
 from kalmark.events import Id
 from kalmark.geometry.spaces import POINT2, POINT3, Space
 
@@ -124,7 +133,7 @@ def sightings(
     """
 
     def residuals(*values: Array) -> tuple[Array, Array]:
-        return looked(view, np.concatenate(values[:-1], axis=1), values[-1], y)
+        return innovations_and_jacobians(view, np.concatenate(values[:-1], axis=1), values[-1], y)
 
     return Factor(Term(residuals, blocks), y, R, huber, sensor, view)
 
@@ -176,7 +185,7 @@ def motions(
     started, space = previous >= 0, POSE_SPACES[step.shape[1]]
 
     def residuals(a: Array, b: Array) -> tuple[Array, Array]:
-        w, W = beyond(np.where(started[:, None], a, ORIGIN[space.size]), b, step)
+        w, W = step_residuals(np.where(started[:, None], a, ORIGIN[space.size]), b, step)
         W[~started, :, : space.dof] = 0.0
         return w, -W
 

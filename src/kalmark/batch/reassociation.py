@@ -20,8 +20,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
-from kalmark.association.gated import assigned
-from kalmark.batch.batch_state import LANDMARKS, Ints, looked
+from kalmark.association.gated import assign
+from kalmark.batch.batch_state import LANDMARKS, Ints, innovations_and_jacobians
 from kalmark.batch.data import BatchReplay
 from kalmark.batch.solver import Batch, optimum
 from kalmark.events import Id
@@ -55,7 +55,7 @@ class Reassociated:
     settled: bool
 
 
-def reassociated(replay: BatchReplay, may_change: Flags, numbers: Iterable[int] = range(1, ROUNDS + 1)) -> Reassociated:
+def reassociate(replay: BatchReplay, may_change: Flags, numbers: Iterable[int] = range(1, ROUNDS + 1)) -> Reassociated:
     """Decide again which landmark the observations (O,) are of that `may_change`, beginning at those of the replay.
 
     Takes a round a number of `numbers` until nothing changes, each of O(observations log landmarks) beside the optimum.
@@ -75,7 +75,7 @@ def reassociated(replay: BatchReplay, may_change: Flags, numbers: Iterable[int] 
             look.landmarks[new[-1]] = place
             for row in rows:
                 decided[row] = new[-1]
-        same = dict(coinciding(batch, decided, look, new))
+        same = dict(find_coincident(batch, decided, look, new))
         merged = {one: same.get(other, other) for one, other in merged.items()} | same
         decided = [same.get(name, name) if name is not None else None for name in decided]
         settled = decided == names
@@ -149,7 +149,7 @@ class _Look:
                 for column, k in enumerate(some):
                     here = near == k
                     d2[here.any(axis=1), column] = seen.d2[part][here]
-                taken_by = assigned(d2, gate) if some else np.full(len(part), -1)
+                taken_by = assign(d2, gate) if some else np.full(len(part), -1)
                 for row, pair in zip(seen.row[part].tolist(), taken_by.tolist(), strict=True):
                     decided[row] = self.ids[some[pair]] if pair >= 0 else None
         return decided
@@ -212,14 +212,14 @@ def _seen(replay: BatchReplay, batch: Batch, key: tuple[str, str, int], may_chan
     view, d2 = view_of(mount.sensor, given.landmark, at), np.empty(near.shape)
     R_inverse = np.linalg.inv(R)
     for column in range(number):
-        z, _ = looked(view, poses[node], batch.means[near[:, column]], y)
+        z, _ = innovations_and_jacobians(view, poses[node], batch.means[near[:, column]], y)
         d2[:, column] = np.nan_to_num(np.einsum("ki,kij,kj->k", z, R_inverse, z), nan=FAR)
     by = np.argsort(d2, axis=1)
     near, d2 = np.take_along_axis(near, by, axis=1), np.take_along_axis(d2, by, axis=1)
     return [_Seen(row, near, d2, places, L_y @ R @ L_y.swapaxes(1, 2))]
 
 
-def coinciding(batch: Batch, names: Sequence[Id | None], look: _Look, new: Sequence[Id]) -> list[tuple[Id, Id]]:
+def find_coincident(batch: Batch, names: Sequence[Id | None], look: _Look, new: Sequence[Id]) -> list[tuple[Id, Id]]:
     """Return pairs of landmarks that are one; each landmark is in one pair at most.
 
     The first is the new one, or that of fewer observations.

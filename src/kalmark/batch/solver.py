@@ -27,7 +27,7 @@ from scipy.sparse.linalg import splu
 from threadpoolctl import threadpool_limits
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState, Ints, unsolved
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState, Ints, unsolvable_problem
 from kalmark.batch.problem import Linearized, Problem
 from kalmark.errors import KalmarkError
 from kalmark.events import Id
@@ -98,7 +98,7 @@ def optimum(
                 at, P = search.at, Reduced(problem, search.at).joint()
                 chi2, dof = 2 * search.cost(at, search.multipliers), len(at.z) + len(at.w) - int(problem.free.sum())
                 return Batch(problem.ids, problem.nodes, at.state, P, chi2, dof, iteration, search.size)
-    raise unsolved(f"the last of {iteration} steps is {search.size:.3g} of the map, expected {tolerance:g}")
+    raise unsolvable_problem(f"the last of {iteration} steps is {search.size:.3g} of the map, expected {tolerance:g}")
 
 
 class _Search:
@@ -125,7 +125,7 @@ class _Search:
             except UndeterminedError:
                 pass
         if not self._take(Reduced(self.problem, self.at)):
-            raise unsolved("no step lowers the cost, expected a better start or fewer outliers")
+            raise unsolvable_problem("no step lowers the cost, expected a better start or fewer outliers")
 
     def cost(self, at: Linearized, multipliers: Array) -> float:
         """Return half the sum of squared residuals: of the factors, and of the motion's errors w = Q m."""
@@ -161,7 +161,7 @@ def _refuse_hidden(problem: Problem, start: BatchState) -> None:
             known = factor.term.blocks[-1].group == LANDMARKS
             what = f"{problem.kind if known else 'pose'} {problem.ids[target] if known else target}"
             what += f" to {factor.sensor[1]} at pose {node}"
-            raise unsolved(f"the start does not show {what}, which saw it")
+            raise unsolvable_problem(f"the start does not show {what}, which saw it")
 
 
 def followers(at: Linearized) -> sp.csr_array:

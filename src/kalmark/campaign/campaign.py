@@ -20,7 +20,7 @@ from kalmark.campaign.scoring import NEES, Scores
 from kalmark.files import replace_folder, write
 from kalmark.geometry.gaussian import quantile
 from kalmark.results.evaluate import none_for_nan
-from kalmark.results.scene import COLOURS, grouped
+from kalmark.results.scene import COLOURS, group_steps
 
 POINTS = 400  # of a curve, at most
 COARSE, FINE = (1.0, 2.0, 5.0), (1.0, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # ticks in a decade
@@ -123,7 +123,7 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> dict[str, Any]:
     result["landmarks"] = mean(np.array([float(s.landmarks) for s in scores]))
     dof = sum(s.nis_dof for s in scores)
     result["nis_per_dof"] = sum(s.nis for s in scores) / dof if dof else float("nan")
-    return result | mounts(scores)
+    return result | mount_uncertainties(scores)
 
 
 def kinds(scores: Sequence[Scores]) -> list[str]:
@@ -132,7 +132,7 @@ def kinds(scores: Sequence[Scores]) -> list[str]:
     return [n for n in NEES if n in always or any(np.isfinite(s.series[n]).any() for s in scores)]
 
 
-def mounts(scores: Sequence[Scores]) -> dict[str, float]:
+def mount_uncertainties(scores: Sequence[Scores]) -> dict[str, float]:
     """Return how uncertain mounts came out at the end of the runs: the worst of each run.
 
     `mount_m`, `mount_deg`: RMS over runs; `mount_sure`: runs whose NEES is below its 99.73 % quantile, 3 sigma.
@@ -140,13 +140,13 @@ def mounts(scores: Sequence[Scores]) -> dict[str, float]:
     if not any(np.isfinite(s.series["mount_m"]).any() for s in scores):
         return {}
     names = ("mount", "mount_dof", "mount_m", "mount_rad")
-    last = {name: np.array([last_value(s.series[name]) for s in scores]) for name in names}
+    last = {name: np.array([largest_last_value(s.series[name]) for s in scores]) for name in names}
     below = last["mount"] <= quantile(0.9973, last["mount_dof"])
     degrees = float(np.degrees(rms(last["mount_rad"])))
     return {"mount_m": rms(last["mount_m"]), "mount_deg": degrees, "mount_sure": int(below.sum())}
 
 
-def last_value(values: Array) -> float:
+def largest_last_value(values: Array) -> float:
     """Return the largest, over robots, of the last finite values."""
     rows = [row[np.isfinite(row)] for row in values]
     return max((float(row[-1]) for row in rows if len(row)), default=float("nan"))
@@ -177,7 +177,7 @@ def curves(t_s: Array, value: Array, *others: Array) -> Array:
     NaN stands where a gap in time is, so that no line is drawn across it.
     """
     steps = np.flatnonzero(np.isfinite(value))
-    groups, gaps = grouped(steps, (t_s[steps] * 1e9).astype(np.int64), -(-len(t_s) // POINTS))
+    groups, gaps = group_steps(steps, (t_s[steps] * 1e9).astype(np.int64), -(-len(t_s) // POINTS))
     size = np.bincount(groups)
     return np.insert([np.bincount(groups, row[steps]) / size for row in (t_s, value, *others)], gaps, np.nan, axis=1)
 

@@ -33,12 +33,12 @@ from kalmark.management.attention import EVERYTHING
 from kalmark.models.landmarks import Point2D
 from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
 from kalmark.models.observe import call_move, step_of
-from kalmark.models.protocols import calibrating, parameter_covariance
+from kalmark.models.protocols import parameter_covariance, self_calibrating
 from kalmark.models.sensors import RangeBearing
-from kalmark.results.measures import MAP_NEES, in_log, map_nees
-from kalmark.simulate.robots import Chance, drawn_start, scenery_of
+from kalmark.results.measures import MAP_NEES, log_translation, map_nees
+from kalmark.simulate.robots import Chance, draw_start, scenery_of
 from kalmark.simulate.routes import Constant, Drive
-from kalmark.simulate.sights import POINTS, SimulatedSensing, Things, chosen, noisy, possible
+from kalmark.simulate.sights import POINTS, SimulatedSensing, Things, is_reportable, noisy_measurements, select_reported
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
@@ -60,11 +60,11 @@ call_predict, call_correct = by_address(PREDICT), by_address(CORRECT)
 
 # of ranges and bearings: sigma_range_m, sigma_range_rel, sigma_bearing_rad, scale and bias_m
 Noise = tuple[float, float, float, float, float]
-InSight = tuple[Index, Index, Array, Array]  # as `in_sight` returns
+InSight = tuple[Index, Index, Array, Array]  # as `visible_points` returns
 Sightings = tuple[Index, Index, Index, Array, Array]  # as `by_landmark` returns
 
 
-def noise_of(sensor: RangeBearing) -> Noise:
+def sensor_noise(sensor: RangeBearing) -> Noise:
     """Return the noise of a sensor as compiled code takes it."""
     return sensor.sigma_range_m, sensor.sigma_range_rel, sensor.sigma_bearing_rad, sensor.scale, sensor.bias_m
 
@@ -99,7 +99,7 @@ def refusal(world: Any, configs: Mapping[str, Config]) -> str:
 
 def _odd_models(motion: Any, mount: Mount) -> str:
     """Return what of a motion and a mounted sensor the engine does not run."""
-    if type(motion) not in MOTIONS or calibrating(motion) is not None:
+    if type(motion) not in MOTIONS or self_calibrating(motion) is not None:
         return "the batched engine has velocities and increments of the plane that do not calibrate themselves"
     if (
         type(mount.sensor) is not RangeBearing
@@ -137,7 +137,7 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
 
 # ---------------------------------------------------------------------- simulation
 @compiled
-def driven(
+def drive_route(
     model: tuple[int, Array], kind: int, start: Array, dt_s: float, errors: Array, walk: Array, u: Array, places: Array,
     limits: tuple[float, float], on_robot: bool,
 ) -> tuple[Array, Array, bool]:  # fmt: skip
@@ -145,7 +145,7 @@ def driven(
 
     `errors` (steps, m) are those of the controls, `walk` (steps, 3 or 0) is the diffusion in the robot's frame; `kind`
     is the motion's number among `MOTIONS`, `limits` speed and turning radius.  The last answer is whether the places
-    were enough.  As `simulate.robots.step` and `simulate.routes`.
+    were enough.  As `simulate.robots.step_robot` and `simulate.routes`.
     """
     steps, m = errors.shape
     speed, radius = limits
@@ -187,7 +187,9 @@ def driven(
 
 
 @compiled
-def in_sight(states: Array, at: Array, points: Array, scans: Index, limits: tuple[float, float, float]) -> InSight:
+def visible_points(
+    states: Array, at: Array, points: Array, scans: Index, limits: tuple[float, float, float]
+) -> InSight:
     """Return what a sensor at `at` (3,) sees at the steps `scans`: steps (N,), points (N,) and their distances (N,).
 
     Last is where the points are in the sensor's frame (N, 2).  `limits` are the least and the greatest range and half
@@ -211,7 +213,7 @@ def in_sight(states: Array, at: Array, points: Array, scans: Index, limits: tupl
 
 
 @compiled
-def nearest(steps: Index, distance: Array, most: int) -> Flags:
+def select_nearest(steps: Index, distance: Array, most: int) -> Flags:
     """Return which of what is seen, at `steps` (N,) in order, is among the `most` nearest of its step.
 
     Of those that are as near, the first.
@@ -227,10 +229,10 @@ def nearest(steps: Index, distance: Array, most: int) -> Flags:
     return near
 
 
-def reported(
+def reported_observations(
     world: World, sensing: SimulatedSensing, things: Things, sensor: RangeBearing, chance: Chance, seen: InSight
 ) -> Sightings:
-    """Return what is reported of all that is seen, with noise: as `sights.chosen`, `faulty`, `noisy` and `possible`."""
+    """Return the reported, noisy part of all visible points: from `select_reported` to `is_reportable`."""
     steps, numbers, _, v = seen
     rows, measured = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
     for kept in reports(world, things, seen, chance):
@@ -240,9 +242,9 @@ def reported(
             lost[late] = chance.faults.random(int(late.sum())) < sensing.dropouts
             kept = kept[~lost]  # noqa: PLW2901
         rows.append(kept)
-        measured.append(noisy(sensor, sensor.expect(v[kept])[0], chance.sight))
+        measured.append(noisy_measurements(sensor, sensor.expect(v[kept])[0], chance.sight))
     of, y = np.concatenate(rows), np.concatenate(measured)
-    there = possible(sensor, y)
+    there = is_reportable(sensor, y)
     return by_landmark(world.steps, steps[of[there]], things.values, numbers[of[there]], y[there])
 
 
@@ -269,7 +271,7 @@ def reports(world: World, things: Things, seen: InSight, chance: Chance) -> Iter
     steps, numbers, distance, _ = seen
     rows, at = np.arange(len(steps)), 0
     if world.max_per_scan is not None:
-        rows = rows[nearest(steps, distance, world.max_per_scan)]
+        rows = rows[select_nearest(steps, distance, world.max_per_scan)]
     if world.new_per_step is None:
         yield rows
         return
@@ -280,7 +282,9 @@ def reports(world: World, things: Things, seen: InSight, chance: Chance) -> Iter
         yield rows[slice(*np.searchsorted(rows, (at, here)))]
         if then > here:
             some = slice(here, then)
-            told = chosen(things, numbers[some], distance[some], world.new_per_step, world.max_per_scan, chance.sight)
+            told = select_reported(
+                things, numbers[some], distance[some], world.new_per_step, world.max_per_scan, chance.sight
+            )
             yield here + told
         at = then
 
@@ -315,7 +319,7 @@ def noises(
 
 
 @compiled
-def start(
+def start_landmark(
     x: Array, x_first: Array, P: Array, n: int, at: Array, y: Array,
     noise: Noise,
 ) -> None:  # fmt: skip
@@ -334,7 +338,7 @@ def start(
 
 
 @compiled
-def filtered(
+def filter_run(
     ways: tuple[int, int, int], routines: corrections.Routines, view: Any, motion: tuple[int, Array],
     tables: tuple[Table, Table, int], started: tuple[Array, Array], controls: tuple[Array, Array, Array, Array, bool],
     sightings: Sightings, sensed: tuple[Array, Noise],
@@ -381,7 +385,7 @@ def filtered(
         if not ok:
             break
         for i in range(middle, high):
-            start(x, x_first, P, 3 + 2 * count, at, y[i : i + 1], noise)
+            start_landmark(x, x_first, P, 3 + 2 * count, at, y[i : i + 1], noise)
             count += 1
         if high > low:
             keep_pose(x, P, mean[k], cov[k])
@@ -412,13 +416,13 @@ def score_map(x: Array, P: Array, places: Array, turns: bool, truth: Array) -> A
     for i in range(len(places) + 1):
         j, true = (2 * i + 1, places[i - 1]) if i else (0, truth[:2])
         d[1, j], d[1, j + 1] = true[0] - x[j], true[1] - x[j + 1]
-        d[0, j], d[0, j + 1] = in_log(a if turns else 0.0, d[1, j], d[1, j + 1])
+        d[0, j], d[0, j + 1] = log_translation(a if turns else 0.0, d[1, j], d[1, j + 1])
     return map_nees(d, P, 3 + 2 * np.arange(len(places)), np.full(len(places), 2))
 
 
 # ---------------------------------------------------------------------- runs
 class _Filter:
-    """An estimator of the engine: the arguments of `filtered` that are the same in all runs."""
+    """An estimator of the engine: the arguments of `filter_run` that are the same in all runs."""
 
     def __init__(self, slam: Slam, name: str, landmarks: int) -> None:
         robot, estimator = slam.robots[name], slam.estimator
@@ -442,7 +446,7 @@ class _Filter:
         cov = np.zeros((3, 3)) if robot.cov is None else np.asarray(robot.cov)
         self.start = np.array(robot.start), np.array(cov)
         self.control = motion.control_noise(NO_CONTROL), density_of(motion), motion.held
-        self.sensed = np.array(mount.at), noise_of(mount.sensor)
+        self.sensed = np.array(mount.at), sensor_noise(mount.sensor)
         limits = (estimator.iterations, float(estimator.tolerance)) if isinstance(estimator, Invariant) else (1, 0.0)
         self.rules = (float(channel.gate), *limits)
         self.coordinates = estimator.coordinates
@@ -488,8 +492,8 @@ class Engine:
         if driven_ is None:
             return None
         states, u = driven_
-        seen = in_sight(states, self.at, things.values, self.scans, self.limits)
-        sightings = reported(world, self.sensing, things, self.sensor, chance, seen)
+        seen = visible_points(states, self.at, things.values, self.scans, self.limits)
+        sightings = reported_observations(world, self.sensing, things, self.sensor, chance, seen)
         scores = {}
         for label, one in self.filters.items():
             score = self._filter(one, states, u, sightings, map_every)
@@ -501,7 +505,7 @@ class Engine:
     def _drive(self, things: Things, chance: Chance) -> tuple[Array, Array] | None:
         """Return the true states (steps + 1, 3) and the controls (steps, m) that the filters are given."""
         world, motion = self.world, self.robot.motion
-        state = drawn_start(self.robot, chance.route)
+        state = draw_start(self.robot, chance.route)
         walks = np.diagonal(density_of(motion) * world.dt_s)
         variances = np.append(np.diagonal(motion.control_noise(NO_CONTROL)), walks)
         draws = np.sqrt(variances) * chance.control.standard_normal((world.steps, len(variances)))
@@ -519,7 +523,7 @@ class Engine:
             places = np.concatenate([places, np.reshape([p[:2] for p in islice(ahead, more)], (-1, 2))])
             on_robot = world.noise_on == "robot"
             args = self.motion, self.kind, state, world.dt_s, told, walk, u, places, limits, on_robot
-            states, controls, enough = driven(*args)
+            states, controls, enough = drive_route(*args)
             if enough:
                 return states, controls
             if len(places) > ALL_TARGETS * world.steps:
@@ -537,7 +541,7 @@ class Engine:
         """Filter and score a run; None if the filter diverges."""
         N, density, held = f.control
         scored = map_every, f.coordinates == "log", states
-        ok, mean, P, of_map, x, nis, fused = filtered(
+        ok, mean, P, of_map, x, nis, fused = filter_run(
             f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
             (u, self._seconds, N, density, held), sightings, f.sensed, f.rules, scored,
         )  # fmt: skip

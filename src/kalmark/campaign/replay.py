@@ -20,7 +20,7 @@ from numpy.random import Generator, SeedSequence
 
 from kalmark.arrays import Array
 from kalmark.config.building import build_robot, build_slam, config_dict
-from kalmark.config.opening import described
+from kalmark.config.opening import with_log_description
 from kalmark.config.schema import Config, StartConfig
 from kalmark.config.sections import section_of
 from kalmark.config.tree import name_on
@@ -30,15 +30,31 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.spaces import SE2
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.progress import track
-from kalmark.models.observe import composed
-from kalmark.models.protocols import calibrating
+from kalmark.models.observe import sensor_pose
+from kalmark.models.protocols import self_calibrating
 from kalmark.report import Report
 from kalmark.results.landmark_table import MapLandmarks, refuse_other_than_points
 from kalmark.results.recording import config_yaml
 from kalmark.results.warnings import NO_ID
-from kalmark.simulate.robots import Chance, Key, Simulation, body_axes, diffused, drawn_mount, drawn_start, told
-from kalmark.simulate.sights import POINTS, exact, gaussian, in_frame, noisy, possible
-from kalmark.slam.held_control import HeldInput, MotionPart, noise_of
+from kalmark.simulate.robots import (
+    Chance,
+    Key,
+    Simulation,
+    add_diffusion,
+    body_axes,
+    draw_mount,
+    draw_start,
+    given_control,
+)
+from kalmark.simulate.sights import (
+    POINTS,
+    exact_measurements,
+    gaussian,
+    is_reportable,
+    noisy_measurements,
+    things_in_frame,
+)
+from kalmark.slam.held_control import HeldInput, MotionPart, control_covariance
 from kalmark.slam.robot import Robot
 from kalmark.slam.slam import Slam
 
@@ -81,7 +97,7 @@ class Recorded(NamedTuple):
     landmarks: dict[Id, Array]
 
 
-def recorded(config: Config, log: Log, progress: bool = True) -> Recorded:
+def record_for_replay(config: Config, log: Log, progress: bool = True) -> Recorded:
     """Return what a log holds for a replay.  Raises KalmarkError where the filter gives up, or nothing was seen."""
     slam = build_slam(config, log)
     bar = track(log.events, f"{log.name}, the map", len(log.events), show=progress)
@@ -210,20 +226,22 @@ def replay_of(config: Config, log: Log, progress: bool = True) -> Replay:
 
     Raises ConfigError on what cannot be replayed, KalmarkError where the filter gives up or nothing was seen.
     """
-    config = described(config, log)
+    config = with_log_description(config, log)
     robots = {name: build_robot(config, name, log) for name in log.robots}
     sections: dict[str, Any] = {}
     for name, robot in robots.items():
-        refuse_other(config, name, robot)
+        refuse_unsupported(config, name, robot)
         section, (x_m, y_m, theta_rad) = config.robots.get(name) or config.robots["each"], robot.start
         start = section.start or StartConfig(x_m=float(x_m), y_m=float(y_m), theta_rad=float(theta_rad))
         sections[name] = section.model_copy(update={"start": start})
     settings = config.model_copy(update={"robots": sections})
     written = config_yaml(config_dict(config))
-    return Replay(name_on(config.name, log.name), settings, log.robots, recorded(settings, log, progress), written)
+    return Replay(
+        name_on(config.name, log.name), settings, log.robots, record_for_replay(settings, log, progress), written
+    )
 
 
-def refuse_other(config: Config, name: str, robot: Robot) -> None:
+def refuse_unsupported(config: Config, name: str, robot: Robot) -> None:
     """Refuse robots of space, states of more than a pose, and sensors whose scans a detector searches for landmarks."""
     path = ("robots", name if name in config.robots else "each")
     got = f"got {config.robots[path[1]].motion.type}"
@@ -258,7 +276,7 @@ class _Driven:
     def move(self, part: MotionPart, rng: Generator) -> None:
         """Move by a part of a control; what it diffuses is that of the control that the filter knows."""
         self.state, *_ = self.motion.move(self.state, part.u, part.dt_s)
-        self.state = diffused(self.motion, self.state, self.told, part.dt_s, rng)
+        self.state = add_diffusion(self.motion, self.state, self.told, part.dt_s, rng)
 
 
 class _Replaying:
@@ -269,10 +287,10 @@ class _Replaying:
         self.robots: dict[str, _Driven] = {}
         for name in replay.robots:
             robot = build_robot(replay.settings, name)
-            motion, start = robot.motion, drawn_start(robot, chance.route)
-            model = calibrating(motion)
+            motion, start = robot.motion, draw_start(robot, chance.route)
+            model = self_calibrating(motion)
             constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.route)
-            sensors = {key: drawn_mount(mount, chance.mounts) for key, mount in robot.sensors.items()}
+            sensors = {key: draw_mount(mount, chance.mounts) for key, mount in robot.sensors.items()}
             self.robots[name] = _Driven(motion, start, constants, sensors, HeldInput(motion))
         self.events: list[Event] = []
         self.origins: dict[Key, tuple[Id | None, ...]] = {}
@@ -304,9 +322,9 @@ class _Replaying:
         """Take the control that leads back to the path, and tell it with noise."""
         event, robot, rng = steer.event, self.robots[steer.event.robot], self.chance.control
         robot.advance(event.t_ns, rng, last=True)
-        N = noise_of(robot.motion, event)
-        u = steered(robot.motion, robot.state, steer, N)
-        robot.told = told(robot.motion, u, robot.constants, steer.dt_s) + gaussian(N, rng)
+        N = control_covariance(robot.motion, event)
+        u = steer_to_path(robot.motion, robot.state, steer, N)
+        robot.told = given_control(robot.motion, u, robot.constants, steer.dt_s) + gaussian(N, rng)
         self.events.append(replace(event, u=robot.told))
         for part in robot.drive.accept(replace(event, u=u, cov=None)):
             robot.move(part, rng)
@@ -318,17 +336,17 @@ class _Replaying:
             self.robots[str(name)].advance(event.t_ns, self.chance.control)
         places = {name: other.state[:2] for name, other in self.robots.items()} | self.replay.recorded.landmarks
         sensor, at = robot.sensors[event.sensor]
-        v = in_frame(POINTS, composed(robot.state, at)[0], np.array([places[name] for name in look.real]))
-        inside, e = exact(sensor, v, np.zeros(len(v)))
-        y = noisy(sensor, e[inside], self.chance.sight, None if look.cov is None else look.cov[inside])
-        seen = possible(sensor, y)
+        v = things_in_frame(POINTS, sensor_pose(robot.state, at)[0], np.array([places[name] for name in look.real]))
+        inside, e = exact_measurements(sensor, v, np.zeros(len(v)))
+        y = noisy_measurements(sensor, e[inside], self.chance.sight, None if look.cov is None else look.cov[inside])
+        seen = is_reportable(sensor, y)
         rows = np.flatnonzero(inside)[seen].tolist()
         told = None if event.ids is None else [event.ids[look.rows[i]] for i in rows]
         self.events.append(look.scan(y[seen], told, rows))
         self.origins[event.t_ns, event.robot, event.sensor] = tuple(look.real[i] for i in rows)
 
 
-def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
+def steer_to_path(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
     """Return the control (m,) between the log's and the one from r (size,) to the path at the end of the interval.
 
     Least squares: the control differs from the log's by its noise N (m, m), bias and diffusion, the end from the path
@@ -338,7 +356,7 @@ def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
     if motion.held and not dt_s:
         return u
     end, _, R_u = motion.move(r, u, dt_s)
-    M, D, model = N, motion.diffusion(u, dt_s), calibrating(motion)
+    M, D, model = N, motion.diffusion(u, dt_s), self_calibrating(motion)
     if model is not None:
         B = model.calibration_effect(u, dt_s)
         M = M + B @ model.calibration_cov @ B.T
@@ -347,7 +365,7 @@ def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
         M = M + A @ D @ A.T
     if not M.any():
         return u
-    goal, v = facing_path(r, end, steer.goal, dt_s), u
+    goal, v = turn_to_path(r, end, steer.goal, dt_s), u
     for _ in range(2):
         end, _, R_u = motion.move(r, v, dt_s)
         z = goal - end
@@ -357,7 +375,7 @@ def steered(motion: Any, r: Array, steer: Steer, N: Array) -> Array:
     return v
 
 
-def facing_path(r: Array, end: Array, goal: Array, dt_s: float) -> Array:
+def turn_to_path(r: Array, end: Array, goal: Array, dt_s: float) -> Array:
     """Return the pose `goal` (3,), rotated towards the path by the lateral distance of `end`: cars do not slip."""
     c, s = np.cos(goal[2]), np.sin(goal[2])
     beside = c * (end[1] - goal[1]) - s * (end[0] - goal[0])

@@ -168,7 +168,7 @@ def run_sweep(
     if folder is not None:
         of = {cell.label: digest for cell, digest in zip(cells, digests, strict=True)}
         kept = Kept(Path(folder), {"seed": seed, "map_every": map_every}, of, resume)
-    ready = finished(plans, digests, runs, kept, jobs, backend, address)
+    ready = results_of_plans(plans, digests, runs, kept, jobs, backend, address)
     bar = track(ready, f"campaign {cells[0].scene.name}", runs * len(plans), show=progress)
     results = dict(bar)
     campaigns = []
@@ -221,7 +221,7 @@ def configs_of(world: Scene, estimators: Sequence[str] | None) -> dict[str, Conf
     return configs
 
 
-def finished(
+def results_of_plans(
     plans: Sequence[Plan],
     digests: Sequence[str],
     runs: int,
@@ -259,7 +259,7 @@ def results_of(
     if not tasks:
         return
     if backend == "loky":
-        groups = grouped(plans, tasks)
+        groups = group_tasks(plans, tasks)
         jobs = min(jobs or cpu_count(), len(groups))
         if jobs == 1:
             for cell, numbers in groups:
@@ -271,13 +271,13 @@ def results_of(
         before = len(left)
         try:
             with joblib_backend(backend, address):
-                for task, result in _in_parallel(plans, grouped(plans, [*left]), jobs or -1):
+                for task, result in _in_parallel(plans, group_tasks(plans, [*left]), jobs or -1):
                     del left[task]
                     yield task, result
         except KalmarkError:
             raise
         except Exception as error:
-            if not died(error):
+            if not worker_died(error):
                 raise
             tries = tries + 1 if len(left) == before else 0
             if tries == TRIES:
@@ -295,7 +295,7 @@ def compile_engine(plans: Iterable[Plan]) -> None:
             return
 
 
-def grouped(plans: Sequence[Plan], tasks: Sequence[Task]) -> list[Group]:
+def group_tasks(plans: Sequence[Plan], tasks: Sequence[Task]) -> list[Group]:
     """Return tasks as groups that a worker does at once: of the engine many short runs, else each alone."""
     groups: list[Group] = []
     for cell, number in tasks:
@@ -323,7 +323,7 @@ def _in_parallel(plans: Sequence[Plan], groups: Sequence[Group], jobs: int) -> I
             yield from done
 
 
-def died(error: BaseException | None) -> bool:
+def worker_died(error: BaseException | None) -> bool:
     """Return whether an exception, or its cause, says that a worker died: one of loky, dask or ray."""
     while error is not None:
         if {cls.__name__ for cls in type(error).__mro__} & DEATHS:
@@ -352,11 +352,11 @@ def joblib_backend(backend: str, address: str | None = None) -> Iterator[None]:
     with ExitStack() as open_:
         try:
             if backend == "dask":
-                client = installed("dask.distributed", "dask distributed").Client
+                client = require_module("dask.distributed", "dask distributed").Client
                 local = {} if address else {"processes": True, "threads_per_worker": 1}
                 open_.enter_context(client(address, **local))
             elif backend == "ray":
-                register, ray = installed("ray.util.joblib", "ray").register_ray, import_module("ray")
+                register, ray = require_module("ray.util.joblib", "ray").register_ray, import_module("ray")
                 if not ray.is_initialized():
                     ray.init(address, log_to_driver=False)
                     open_.callback(ray.shutdown)
@@ -367,7 +367,7 @@ def joblib_backend(backend: str, address: str | None = None) -> Iterator[None]:
         yield
 
 
-def installed(module: str, packages: str) -> Any:
+def require_module(module: str, packages: str) -> Any:
     """Return an optional module.  Raises KalmarkError, saying what to install, if it is not there."""
     try:
         return import_module(module)

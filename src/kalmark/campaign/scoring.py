@@ -31,7 +31,7 @@ from kalmark.report import Report
 from kalmark.results.measures import (
     MAP_NEES,
     aligned_rmse,
-    diverged,
+    has_diverged,
     map_nees,
     nees,
     point_error,
@@ -103,10 +103,12 @@ def robot_turn(mean: Array, truth: Array) -> Any:
     return wrap(truth[2] - mean[2]) if len(mean) < 7 else rotation_error(mean[3:7], truth[3:7])
 
 
-def landmark(model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array) -> Judged | None:
+def judge_landmark(
+    model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array
+) -> Judged | None:
     """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
     if len(truth) in (4, 6):
-        return _line(model, mean, P, truth, turn, coordinates, eye) if isinstance(model, Segmented) else None
+        return _judge_line(model, mean, P, truth, turn, coordinates, eye) if isinstance(model, Segmented) else None
     if len(truth) == 7:
         if len(mean) != 7:
             return None
@@ -142,7 +144,9 @@ def _position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
     return found[0][0], found[1][0]
 
 
-def _line(model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array) -> Judged | None:
+def _judge_line(
+    model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array
+) -> Judged | None:
     """Judge a line by how far it passes from the two true ends (4|6,): in the plane two numbers, in space four."""
     l, d = mean[None], len(truth) // 2
     base, _ = model.endpoints(l, np.array([[0.0, 1.0]]))
@@ -270,7 +274,7 @@ class _Scorer:
         landmarks = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
         self._score_mounts({n: errors[n] for n, of in self.uncertain.items() if of.carrier == robot}, row, k)
         judged |= mounts | landmarks
-        F = on_diagonal([j.F for j in judged.values()])
+        F = block_diagonal([j.F for j in judged.values()])
         P = F @ slam.covariance(*judged) @ F.T
         d = np.array([np.concatenate([getattr(j, c) for j in judged.values()]) for c in ("own", "world")])
         sizes = np.array([len(j.own) for j in landmarks.values()], dtype=np.int64)
@@ -288,7 +292,7 @@ class _Scorer:
                 continue
             if model.space in (POINT2, POINT3) and len(truth) == self.d:
                 points[name] = truth
-            elif j := landmark(model, slam.mean(name), slam.covariance(name), truth, turn, coordinates, eye):
+            elif j := judge_landmark(model, slam.mean(name), slam.covariance(name), truth, turn, coordinates, eye):
                 yield name, j
         if points:  # all at once
             truth, place = np.array([*points.values()]), np.array([slam.mean(name) for name in points])
@@ -343,11 +347,11 @@ def scores_of(
     place, true, judged, count = found
     aligned = aligned_rmse(place, true) if judged >= d else float("nan")
     parts = zip(own[..., :d], P[..., :d, :d], series["position_m"], truth[..., :d], strict=True)
-    lost = any(diverged(*part) for part in parts)
+    lost = any(has_diverged(*part) for part in parts)
     return Scores(series, aligned, rmse(place - true), count, nis, nis_dof, lost or bool(stopped), stopped)
 
 
-def on_diagonal(blocks: list[Array]) -> Array:
+def block_diagonal(blocks: list[Array]) -> Array:
     """Return the matrix with these blocks on its diagonal: scipy's takes as long as the scores of a map."""
     F, i, j = np.zeros(np.sum([block.shape for block in blocks], axis=0)), 0, 0
     for block in blocks:

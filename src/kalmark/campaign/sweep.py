@@ -15,13 +15,13 @@ import numpy as np
 from scipy.special import stdtrit
 
 from kalmark.arrays import Array
-from kalmark.campaign.campaign import FIGURES, Campaign, kinds, last_value, mean, rms
+from kalmark.campaign.campaign import FIGURES, Campaign, kinds, largest_last_value, mean, rms
 from kalmark.campaign.campaign import FILES as RESULTS
 from kalmark.campaign.scoring import Scores
-from kalmark.campaign.sweep_cells import Cell, shown
+from kalmark.campaign.sweep_cells import Cell, value_as_yaml
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
-from kalmark.results.report import show
+from kalmark.results.report import figure_text
 from kalmark.results.scene import COLOURS
 
 _PANELS = (
@@ -44,12 +44,12 @@ def run_figures(score: Scores, names: list[str], skip: int) -> dict[str, Any]:
     row |= {"landmark_rmse_m": score.landmark_rmse_m, "landmark_rmse_raw_m": score.landmark_rmse_raw_m}
     row |= {"landmarks": score.landmarks, "nis_per_dof": score.nis / score.nis_dof if score.nis_dof else float("nan")}
     if "mount" in names:
-        row["mount_m"] = last_value(series["mount_m"])
-        row["mount_deg"] = float(np.degrees(last_value(series["mount_rad"])))
+        row["mount_m"] = largest_last_value(series["mount_m"])
+        row["mount_deg"] = float(np.degrees(largest_last_value(series["mount_rad"])))
     return row
 
 
-def over_runs(key: str, values: Array) -> tuple[float, float]:
+def figure_over_runs(key: str, values: Array) -> tuple[float, float]:
     """Return the figure of the runs' figures (N,), and half its 95 % interval: a mean, of RMSE the root mean square."""
     values = values[np.isfinite(values)]
     power = values**2 if "rmse" in key else values
@@ -81,7 +81,10 @@ class Sweep:
         if not self.keys:
             return summaries[0]
         head = {key: summaries[0][key] for key in (self.campaigns[0].kind, "seed", "runs", "map_every", "skip")}
-        grid = {key: list({shown(v): v for v in (c.settings[key] for c in self.cells)}.values()) for key in self.keys}
+        grid = {
+            key: list({value_as_yaml(v): v for v in (c.settings[key] for c in self.cells)}.values())
+            for key in self.keys
+        }
         own = ("steps", "path", "dof", "band", "estimators")
         pairs = zip(self.cells, summaries, strict=True)
         cells = [{"settings": cell.settings, **{key: summary[key] for key in own}} for cell, summary in pairs]
@@ -104,7 +107,7 @@ class Sweep:
         rows: list[tuple[list[Any], dict[str, Any]]] = []
         for cell, campaign in zip(self.cells, self.campaigns, strict=True):
             for name, figures in campaign.summary()["estimators"].items():
-                rows.append(([*map(shown, cell.settings.values()), name], figures))
+                rows.append(([*map(value_as_yaml, cell.settings.values()), name], figures))
         found = [(key, label) for key, label in FIGURES if any(f.get(key) is not None for _, f in rows)]
         found = [(key, label) for key, label in found if not keys or key in keys]
         words = [self.campaigns[0].label(label) if key.endswith("_anees") else label for key, label in found]
@@ -139,7 +142,7 @@ class Sweep:
         rows = self.runs()
         for key in self.keys:
             kinds_of = {float if is_number(row[key]) else type(row[key]) for row in rows}
-            as_type = float if kinds_of == {float} else shown if kinds_of != {bool} else bool
+            as_type = float if kinds_of == {float} else value_as_yaml if kinds_of != {bool} else bool
             rows = [row | {key: as_type(row[key])} for row in rows]
         names = list({name: None for row in rows for name in row})
         table = Table.from_pydict({name: [row.get(name) for row in rows] for name in names})
@@ -156,7 +159,7 @@ class Sweep:
         rows = self.runs()
         numeric = [k for k in self.keys if all(is_number(c.settings[k]) for c in self.cells)]
         along = (numeric or self.keys)[-1]
-        values = [*dict.fromkeys(shown(cell.settings[along]) for cell in self.cells)]
+        values = [*dict.fromkeys(value_as_yaml(cell.settings[along]) for cell in self.cells)]
         at = {text: float(text) if numeric else float(i) for i, text in enumerate(values)}
         curves: dict[str, list[dict[str, Any]]] = {}
         for row in rows:
@@ -169,8 +172,11 @@ class Sweep:
         axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (key, label) in zip(axes, panels, strict=True):
             for i, (name, mine) in enumerate(curves.items()):
-                there = [text for text in values if any(shown(row[along]) == text for row in mine)]
-                told = [over_runs(key, np.array([r[key] for r in mine if shown(r[along]) == text])) for text in there]
+                there = [text for text in values if any(value_as_yaml(row[along]) == text for row in mine)]
+                told = [
+                    figure_over_runs(key, np.array([r[key] for r in mine if value_as_yaml(r[along]) == text]))
+                    for text in there
+                ]
                 middle, half = np.array(told).T
                 x = sorted(range(len(there)), key=lambda k, there=there: at[there[k]])  # type: ignore[misc]
                 where = [at[there[k]] for k in x]
@@ -194,7 +200,7 @@ class Sweep:
         lost = sum(score.diverged for c in self.campaigns for scores in c.scores.values() for score in scores)
         told = [f"seed {first.seed}", f"{len(first.t_s)} steps", f"{lost} diverged"]
         told += [f"first {first.skip} steps left out"] if first.skip else []
-        cells = [[c if isinstance(c, str) else show(c) for c in row] for row in rows]
+        cells = [[c if isinstance(c, str) else figure_text(c) for c in row] for row in rows]
         page = resources.files("kalmark.results") / "page"
         return (page / "campaign.html").read_text(encoding="utf-8").format(
             title=html.escape(title),
@@ -219,4 +225,6 @@ def _percent(key: str, value: Any) -> Any:
 
 def _setting(key: str, value: Any) -> str:
     """Return a setting as a curve's label has it: the name of an estimator, or the key's last word and the value."""
-    return shown(value) if key.endswith("estimator.type") else f"{key.rpartition('.')[2]} {shown(value)}"
+    return (
+        value_as_yaml(value) if key.endswith("estimator.type") else f"{key.rpartition('.')[2]} {value_as_yaml(value)}"
+    )

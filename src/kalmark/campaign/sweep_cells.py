@@ -31,10 +31,10 @@ class Cell:
     @property
     def label(self) -> str:
         """The settings in words: "a.b=1, c=2"; empty without a sweep."""
-        return ", ".join(f"{key}={shown(value)}" for key, value in self.settings.items())
+        return ", ".join(f"{key}={value_as_yaml(value)}" for key, value in self.settings.items())
 
 
-def shown(value: Any) -> str:
+def value_as_yaml(value: Any) -> str:
     """Return a swept value as it is written in YAML."""
     return value if isinstance(value, str) else json.dumps(value)
 
@@ -64,7 +64,7 @@ def open_cells(
     """
     grid: dict[str, list[Any]] = {}
     for text in sweeps:
-        key, values = swept(text)
+        key, values = parse_sweep(text)
         if key in grid:
             raise ConfigError(f"--sweep {text}: {key} is given twice, expected each key once")
         grid[key] = values
@@ -83,7 +83,7 @@ def open_cells(
     return [Cell(settings, scene) for settings, scene in zip(combinations, scenes, strict=True)]
 
 
-def swept(text: str) -> tuple[str, list[Any]]:
+def parse_sweep(text: str) -> tuple[str, list[Any]]:
     """Return the key and the values of a sweep.  Raises ConfigError if there are none, or one twice."""
     key, equals, values = (part.strip() for part in text.partition("="))
     where = f"--sweep {text}"

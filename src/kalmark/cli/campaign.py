@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kalmark.cli.shared import Overrides, announce_compilation_elsewhere, computing, number, print_table, say, writable
+from kalmark.cli.shared import (
+    Overrides,
+    announce_compilation_elsewhere,
+    figure_text,
+    limit_blas_threads,
+    print_table,
+    say,
+    writable,
+)
 
 if TYPE_CHECKING:
     from kalmark.campaign import Campaign, Sweep
@@ -61,7 +69,7 @@ def campaign(
     out = writable(out or Path("out") / f"campaign-{Path(world).stem}")
     refuse_unknown(estimator)
     check_backend(backend.value, address)
-    with computing():
+    with limit_blas_threads():
         cells = open_cells(world, sweep or (), overrides or (), log)
     result = run_sweep(
         cells, runs, estimator, seed, jobs, backend.value, skip=skip, address=address, folder=out, resume=resume
@@ -81,7 +89,7 @@ def print_sweep(sweep: Sweep) -> None:
     head, rows = sweep.table(SHOWN)
     first = sweep.campaigns[0]
     title = f"{first.world}: {first.runs} runs a cell, seed {first.seed}; ANEES (in brackets: of a consistent filter)"
-    texts = [[cell if isinstance(cell, str) else number(cell) for cell in row] for row in rows]
+    texts = [[cell if isinstance(cell, str) else figure_text(cell) for cell in row] for row in rows]
     print_table(title, head, texts, align="<" * (len(sweep.keys) + 1) + ">" * (len(head) - len(sweep.keys) - 1))
 
 
@@ -97,6 +105,6 @@ def print_campaign(campaign: Campaign) -> None:
             band = campaign.band(name) if name in NEES else None
             words = (campaign.label(name) if name in NEES else label, "{:.2f} to {:.2f}".format(*band) if band else "")
             unit = "%" if key.endswith("_inside") else ""
-            rows.append((*words, *(number(figures.get(key), unit) for figures in estimators.values())))
+            rows.append((*words, *(figure_text(figures.get(key), unit) for figures in estimators.values())))
     title = f"{campaign.world}: {campaign.runs} runs, seed {campaign.seed}; ANEES (in brackets: of a consistent filter)"
     print_table(title, ("", "95 % band, one step", *estimators), rows, align="<>" + ">" * len(estimators))

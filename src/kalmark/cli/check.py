@@ -19,7 +19,7 @@ def check(
     """Check a model of your own: shapes, and Jacobians against differences."""
     import numpy as np
 
-    from kalmark.declare import line_of
+    from kalmark.declare import line_of_error
     from kalmark.models.model_check import check_model
 
     found = _model(model)
@@ -28,7 +28,7 @@ def check(
     except ModelError as error:
         raise ModelError(f"{model}: {error}") from None
     except Exception as error:
-        raise ModelError(f"{model}: raised {type(error).__name__}: {error}{line_of(error)}") from None
+        raise ModelError(f"{model}: raised {type(error).__name__}: {error}{line_of_error(error)}") from None
     rows = [(f.what, f"{f.error:.1e}", "" if f.ok else f"wrong at {f.where}") for f in findings]
     print_table(model, ("check", "difference", ""), rows, align="<><")
     wrong = [f for f in findings if not f.ok]
@@ -38,7 +38,7 @@ def check(
 
 
 def _model(name: str) -> Any:
-    from kalmark.declare import line_of, load_plugin
+    from kalmark.declare import line_of_error, load_plugin
 
     place, _, attribute = name.partition(":")
     if not place or not attribute:
@@ -50,7 +50,7 @@ def _model(name: str) -> Any:
             sys.path.insert(0, str(Path.cwd()))
             module = import_module(place)
         except Exception as error:
-            what = f"{type(error).__name__}: {error}{line_of(error)}"
+            what = f"{type(error).__name__}: {error}{line_of_error(error)}"
             raise KalmarkError(f"{name}: {place} cannot be imported: {what}") from None
     if attribute not in vars(module):
         raise KalmarkError(f"{name}: {place} has no {attribute}, expected a class, an object or a function")

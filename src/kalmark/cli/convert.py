@@ -9,7 +9,7 @@ import typer
 
 from kalmark.cli.shared import Trust, say, writable
 from kalmark.errors import KalmarkError
-from kalmark.plugins import found, load
+from kalmark.plugins import entry_points_of, load
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
@@ -37,7 +37,7 @@ def convert(
     """Write a log as a native one, a folder of CSV files; with its results as MCAP or g2o; a path as TUM or KITTI."""
     from kalmark.logs import write_native
 
-    writes = out.suffix[1:] in found("writers")
+    writes = out.suffix[1:] in entry_points_of("writers")
     if writes or out.suffix in (G2O, *POSES):
         if out.exists():
             raise KalmarkError(f"{out}: this file exists already, expected a new one")

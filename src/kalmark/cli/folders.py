@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from kalmark.cli.shared import RunFolder, Trust, computing, print_summary, print_table, say, writable
+from kalmark.cli.shared import RunFolder, Trust, limit_blas_threads, print_summary, print_table, say, writable
 
 
 def evaluate(
@@ -29,7 +29,7 @@ def evaluate(
     from kalmark.logs import open_log
     from kalmark.results.run import Run
 
-    with computing():
+    with limit_blas_threads():
         loaded = Run.load(run, trust)
         if truth is not None:
             log = open_log(truth)

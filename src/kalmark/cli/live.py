@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from kalmark.cli.shared import Overrides, computing, say, slam_of, writable
+from kalmark.cli.shared import Overrides, limit_blas_threads, say, slam_of, writable
 from kalmark.errors import DivergedError, KalmarkError
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def live(
 
     if out is not None:
         writable(out.parent)
-    with computing():
+    with limit_blas_threads():
         if Path(config).suffix == ".kmk":
             if overrides:
                 raise KalmarkError("--set changes a configuration, and a saved map has its own")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, computing, print_summary, say, slam_of, writable
+from kalmark.cli.shared import Overrides, limit_blas_threads, print_summary, say, slam_of, writable
 from kalmark.errors import KalmarkError, PluginError, RunError
 from kalmark.plugins import load
 
@@ -47,12 +47,12 @@ def run_log(
     override = [] if on_error is None else [f"log.on_error={on_error}"]
     config, log = cfg.open_run(config_path, log_path, [*overrides, *override], progress=True)
     if own is not None:
-        refuse_other(own, str(log.path))
+        refuse_other_log(own, str(log.path))
     slam = cfg.build_slam(config, log)
     return record(slam, log, progress=progress, on_error=config.log.on_error, config=cfg.config_dict(config))
 
 
-def refuse_other(folder: Path, path: str) -> None:
+def refuse_other_log(folder: Path, path: str) -> None:
     """Refuse to replace the result of another log than that at `path`.  Raises RunError."""
     try:
         other = str(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["log"]["path"])
@@ -83,7 +83,7 @@ def run(
 
     usual = Path("out") / Path(config).stem
     own, out = usual if out is None else None, writable(out or usual)
-    with computing():
+    with limit_blas_threads():
         left_out = on_error.value if on_error else None
         result = run_log(config, log, overrides=overrides or (), on_error=left_out, own=own)
         summary = result.evaluate()
@@ -106,7 +106,7 @@ def warm_up(
     overrides: Overrides = None,
 ) -> None:
     """Compile beforehand all that runs of a configuration need."""
-    with computing():
+    with limit_blas_threads():
         slam_of(config, overrides or ()).warm_up()
     say("compiled: no event of such a run waits for it")
 
@@ -145,7 +145,7 @@ def demo(
     from kalmark.simulate import load_world, simulate
 
     writable(out)
-    with computing():
+    with limit_blas_threads():
         world = load_world("cloister")
         log, config = simulate(world, seed), world.config().model_copy(update={"seed": seed})
         result = record(build_slam(config, log), log, config=config_dict(config))

@@ -1,7 +1,7 @@
 """Configuration: which log, which robots and sensors, which filter, with every default in one frozen model."""
 
 from kalmark.config.building import build_slam, config_dict, slam_described, slam_from_config
-from kalmark.config.opening import in_force, open_config_log, open_run
+from kalmark.config.opening import effective_config, open_config_log, open_run
 from kalmark.config.reading import load_config, resolve_config, shipped_configs
 from kalmark.config.schema import Config
 
@@ -9,7 +9,7 @@ __all__ = [
     "Config",
     "build_slam",
     "config_dict",
-    "in_force",
+    "effective_config",
     "load_config",
     "open_config_log",
     "open_run",

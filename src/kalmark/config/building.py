@@ -12,11 +12,11 @@ import numpy as np
 from pydantic import BaseModel
 
 from kalmark.arrays import Array
-from kalmark.config.opening import described, known_path, open_run
+from kalmark.config.opening import known_map_path, open_run, with_log_description
 from kalmark.config.reading import did_you_mean, load_config, validate
 from kalmark.config.schema import TRUTH, Config, SpaceStartConfig
 from kalmark.config.sections import ModelSection, model_of
-from kalmark.config.tree import EACH, Tree, show
+from kalmark.config.tree import EACH, Tree, quote_value
 from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
@@ -24,10 +24,10 @@ from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Frame, Scan
 from kalmark.geometry.named_poses import pose_of, world_of
 from kalmark.logs.formats import known_formats
-from kalmark.logs.image_files import size_of
+from kalmark.logs.image_files import image_size
 from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
 from kalmark.logs.log import Log
-from kalmark.models.inertial import Inertial, at_rest
+from kalmark.models.inertial import Inertial, start_at_rest
 from kalmark.models.landmark_views import Raised
 from kalmark.models.landmarks import PointHeight2D
 from kalmark.models.protocols import Motion as MotionModel
@@ -46,7 +46,7 @@ def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
     Without a log the robots are those that the configuration names; `each` alone is one robot called "robot".  What is
     `given`, arguments of `Slam`, stands in the place of what is configured.
     """
-    config = config if log is None else described(config, log)
+    config = config if log is None else with_log_description(config, log)
     robots = given.pop("robots", None) or [build_robot(config, name, log) for name in _names(config, log)]
     m = config.map
     kept = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
@@ -74,7 +74,7 @@ def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
             raise config.error(("map", "known"), "got truth, expected a log that has true landmarks")
         return [KnownLandmark(name, place) for name, place in log.landmarks.items()]
     try:
-        path = known_path(config)
+        path = known_map_path(config)
         readers = {ending: read for entry in known_formats().values() for ending, read in entry.known_maps.items()}
         if path.suffix in readers:
             return readers[path.suffix](path, exact)
@@ -127,7 +127,9 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     start, cov = _start(config, (*path, "start"), robot.start, name, log, moves)
     rests: dict[str, Any] = {}
     if isinstance(robot.start, SpaceStartConfig) and robot.start.at_rest:
-        start, cov, rests["rests_until_ns"] = _made(config, (*path, "start"), _at_rest, moves, name, log, start, cov)
+        start, cov, rests["rests_until_ns"] = _made(
+            config, (*path, "start"), _start_at_rest, moves, name, log, start, cov
+        )
     world = moves.space.world
     mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
     if log is not None:
@@ -170,12 +172,12 @@ def _placed(
     told = describe_place(at, world_of(said), cov, behind) if exact else {}
     for key in (section.model_fields_set & told.keys()) - {*EXACT}:
         if not np.allclose(said[key], told[key], rtol=1e-6, atol=1e-9):
-            what = f"expected {show(told[key])} as its {' and '.join(exact)} says, or none of these beside it"
-            raise config.error((*path, key), f"got {show(said[key])}, {what}")
+            what = f"expected {quote_value(told[key])} as its {' and '.join(exact)} says, or none of these beside it"
+            raise config.error((*path, key), f"got {quote_value(said[key])}, {what}")
     return at, cov
 
 
-def _at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any) -> tuple[Array, Array, int]:
+def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any) -> tuple[Array, Array, int]:
     """Return the start of a robot whose log begins at rest, its covariance, and until when (ns) it does.
 
     Raises ModelError.
@@ -183,11 +185,11 @@ def _at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any)
     readings = [event for event in log or () if isinstance(event, Control) and event.robot == name]
     if not readings:
         what = f"{name} has no readings of its inertial unit yet, expected a log that begins at rest"
-        raise ModelError(f"{what}. Events that arrive one by one have none: {BY_SIGMAS}; km.motion.at_rest finds them")
+        raise ModelError(f"{what}. Events one by one have none: {BY_SIGMAS}; km.motion.start_at_rest estimates them")
     t_ns = np.array([event.t_ns for event in readings])
     seconds, u = (t_ns - t_ns[0]) * 1e-9, np.array([event.u for event in readings])
     try:
-        found = at_rest(motion, seconds, u, np.array(start, dtype=np.float64), np.asarray(cov, dtype=np.float64))
+        found = start_at_rest(motion, seconds, u, np.array(start, dtype=np.float64), np.asarray(cov, dtype=np.float64))
     except ModelError as error:
         raise ModelError(f"{error}. Begin where it stands, by log.from_s; or {BY_SIGMAS}") from None
     return found.start, found.cov, int(t_ns[0]) + round(found.until_s * 1e9)
@@ -268,7 +270,7 @@ def refuse_uncalibrated(config: Config, key: str, name: str, log: Log) -> None:
         if "fx_px" not in section.model_fields_set:
             wanted = f"fx_px, ..., or {'.'.join((*where, 'calibration'))}: a file of OpenCV, ROS, Kalibr or EuRoC"
             raise config.error(where, f"got images by a camera without a calibration, expected {wanted}")
-        size = size_of(frames)
+        size = image_size(frames)
         if any(getattr(section, name) != pixels for name, pixels in size.items()):
             got = f"got a calibration for {section.width_px:g} x {section.height_px:g} px"
             wanted = " x ".join(map(str, size.values()))

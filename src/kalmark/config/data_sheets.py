@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.config.tree import OVERRIDE, Tree, show
+from kalmark.config.tree import OVERRIDE, Tree, quote_value
 from kalmark.declare import class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
-from kalmark.events import is_number, most
+from kalmark.events import is_number, largest_magnitude
 from kalmark.logs.camera_calibration import INTRINSICS, read_calibration
-from kalmark.logs.source import mapping
+from kalmark.logs.source import read_mapping
 
 KEY, CALIBRATION = "data_sheet", "calibration"
 NAMES = (
@@ -28,7 +28,7 @@ def data_sheet(path: str | Path) -> dict[str, float]:
     """
     path = Path(path)
     try:
-        content = mapping(path)
+        content = read_mapping(path)
     except LogError as error:
         raise ConfigError(str(error)) from None
     below = content.get("imu0")
@@ -43,8 +43,8 @@ def _parameter(name: str) -> str:
 
 
 def _density(path: Path, name: str, value: Any) -> float:
-    if not is_number(value) or not 0 <= value <= most(name)[0]:
-        raise ConfigError(f"{path}: {name}: got {show(value)}, expected a number >= 0")
+    if not is_number(value) or not 0 <= value <= largest_magnitude(name)[0]:
+        raise ConfigError(f"{path}: {name}: got {quote_value(value)}, expected a number >= 0")
     return float(value)
 
 
@@ -84,7 +84,7 @@ def _take_preset(tree: Tree, where: tuple[str, ...], section: Any) -> None:
 
     place, given = tree.place((*where, "preset")), section.pop("preset")
     if not isinstance(given, str) or given not in MOTIONS:
-        got = f"{place}: {'.'.join((*where, 'preset'))}: got {show(given)}"
+        got = f"{place}: {'.'.join((*where, 'preset'))}: got {quote_value(given)}"
         raise ConfigError(f"{got}, expected one of {', '.join(MOTIONS)}")
     unit, names = MOTIONS[given].sensor, {own.name for own in parameters(class_of("motion", "inertial"))}
     section |= {name: getattr(unit, name) for name in MOTIONS[given].sources if name in names} | section
@@ -103,7 +103,7 @@ def _take(tree: Tree, path: Path | None, where: tuple[str, ...], section: Any) -
     if not isinstance(file, str):
         of_camera = "the path of a camera's calibration, or {file: PATH, camera: NAME}"
         wanted = "the path of Kalibr's imu.yaml" if key == KEY else of_camera
-        raise ConfigError(f"{name}: got {show(given)}, expected {wanted}")
+        raise ConfigError(f"{name}: got {quote_value(given)}, expected {wanted}")
     beside = Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
     try:
         found = data_sheet(beside / file) if key == KEY else calibration(beside / file, camera)

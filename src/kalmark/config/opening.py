@@ -10,7 +10,7 @@ from typing import Any
 from kalmark.config.images import complete, with_images
 from kalmark.config.reading import ENDINGS, config_of, did_you_mean, resolve_config, shipped_configs
 from kalmark.config.schema import COMMON, TRUTH, Config
-from kalmark.config.tree import EACH, OVERRIDE, Tree, merged, read_tree, tree_of, with_each
+from kalmark.config.tree import EACH, OVERRIDE, Tree, merge_trees, read_tree, tree_of, with_each
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import Frame, Scan
 from kalmark.logs import find_data, known_formats, open_log
@@ -33,14 +33,14 @@ def open_run(
     """
     path, tree = tree_at(path_or_name, overrides)
     values = {key: value for key, value in tree.values.items() if key in ("log", "plugins")}
-    alone = in_force(config_of(Tree(values, tree.keys, tree.places), path), log_path)
+    alone = effective_config(config_of(Tree(values, tree.keys, tree.places), path), log_path)
     log = open_config_log(alone, progress=progress)
     refuse_idle(tree, log)
     resolve_each(tree, log)
-    whole = laid_over(tree, log)
+    whole = overlay_on_log(tree, log)
     complete(whole)
     config = config_of(whole, path)
-    found = {"known": str(known_path(config))} if config.map.known not in (None, TRUTH) else {}
+    found = {"known": str(known_map_path(config))} if config.map.known not in (None, TRUTH) else {}
     log = with_images(config, log)
     return config.model_copy(update={"log": alone.log, "map": config.map.model_copy(update=found)}), log
 
@@ -69,7 +69,7 @@ def log_alone(path: str | Path) -> Path | None:
     return found.resolve() if entry.describes_all else None
 
 
-def known_path(config: Config) -> Path:
+def known_map_path(config: Config) -> Path:
     """Return where the known map is: beside the configuration, or where logs are looked for.
 
     Raises LogError, naming all places.
@@ -78,18 +78,18 @@ def known_path(config: Config) -> Path:
     return find_data(str(config.map.known), beside).resolve()
 
 
-def described(config: Config, log: Log) -> Config:
+def with_log_description(config: Config, log: Log) -> Config:
     """Return a configuration with its log's description in force where it has no value."""
     if not log.describes:
         return config
     tree = Tree(config.model_dump(exclude_unset=True), places=dict(config._where))
-    return config_of(laid_over(tree, log), config.file)
+    return config_of(overlay_on_log(tree, log), config.file)
 
 
-def in_force(config: Config, log_path: str | Path | None = None) -> Config:
+def effective_config(config: Config, log_path: str | Path | None = None) -> Config:
     """Return the configuration with its log's path found, or replaced by `log_path`.  Raises ConfigError, LogError."""
-    named: dict[str, Any] = {name: beside(config, getattr(config.log, name)) for name in ("truth", "fixes")}
-    log = config.log.model_copy(update=named | found_options(config) | {"path": str(find_log(config, log_path))})
+    named: dict[str, Any] = {name: resolve_path(config, getattr(config.log, name)) for name in ("truth", "fixes")}
+    log = config.log.model_copy(update=named | resolve_options(config) | {"path": str(find_log(config, log_path))})
     return config.model_copy(update={"log": log})
 
 
@@ -98,31 +98,31 @@ def open_config_log(config: Config, log_path: str | Path | None = None, *, progr
     log, path = config.log, find_log(config, log_path)
     check_format(config, path)
     common = log.model_dump(include={*COMMON})
-    common |= {name: beside(config, common[name]) for name in ("truth", "fixes")}
-    found = open_log(path, log.format, **common, **found_options(config), progress=progress)
+    common |= {name: resolve_path(config, common[name]) for name in ("truth", "fixes")}
+    found = open_log(path, log.format, **common, **resolve_options(config), progress=progress)
     if not found.events:
         raise LogError(f"{path}: true poses alone, expected a log with events; as `log.truth` it scores one")
     return found
 
 
-def found_options(config: Config) -> dict[str, Any]:
+def resolve_options(config: Config) -> dict[str, Any]:
     """Return the options of a configuration's log, with the files found that they name.  Raises LogError."""
     options = config.log.options()
     for option in (option for entry in known_formats().values() for option in entry.options.values()):
         ending = option.values.ending if option.values else ""
         if ending and option.name in options:
             given = options[option.name].items()
-            options[option.name] = {k: str(beside(config, v)) if v.endswith(ending) else v for k, v in given}
+            options[option.name] = {k: str(resolve_path(config, v)) if v.endswith(ending) else v for k, v in given}
     return options
 
 
-def beside(config: Config, path: Any) -> Any:
+def resolve_path(config: Config, path: Any) -> Any:
     """Return where the files are that a configuration names: beside it, or where logs are looked for.
 
     Raises LogError.
     """
     if path is None or isinstance(path, dict):
-        return {robot: beside(config, each) for robot, each in path.items()} if path else None
+        return {robot: resolve_path(config, each) for robot, each in path.items()} if path else None
     own = config.file is not None and config.file not in shipped_configs().values()
     return str(find_data(path, config.file.resolve().parent if config.file and own else None).resolve())
 
@@ -159,7 +159,7 @@ def check_format(config: Config, path: Path) -> None:
             raise config.error(("log", key), message)
 
 
-def laid_over(tree: Tree, log: Log) -> Tree:
+def overlay_on_log(tree: Tree, log: Log) -> Tree:
     """Return a configuration laid over what its log describes: what the user wrote wins, key by key.
 
     Each robot of the log has its own entry then; `each` of the user stands for the robots that he does not name, `each`
@@ -170,13 +170,13 @@ def laid_over(tree: Tree, log: Log) -> Tree:
     below, above = deepcopy(log.describes), deepcopy(tree.values)
     out = Tree(keys=dict(tree.keys), places=dict(tree.places))
     theirs, mine = below.pop("robots", {}), above.get("robots", {})
-    below["robots"] = {name: merged(theirs.get(EACH, {}), theirs.get(name, {})) for name in log.robots}
+    below["robots"] = {name: merge_trees(theirs.get(EACH, {}), theirs.get(name, {})) for name in log.robots}
     if isinstance(mine, dict):
         for name in log.robots:
             if name not in mine and EACH in mine:
                 out.share(mine, ("robots",), name)
         above["robots"] = {name: value for name, value in mine.items() if name != EACH}
-    out.values = merged(below, above)
+    out.values = merge_trees(below, above)
     _place(out, out.values, (), str(log.path or log.name))
     return out
 

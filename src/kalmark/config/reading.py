@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from kalmark.config.data_sheets import take_data_sheets
 from kalmark.config.schema import Config
-from kalmark.config.tree import OVERRIDE, Tree, read_tree, show
+from kalmark.config.tree import OVERRIDE, Tree, quote_value, read_tree
 from kalmark.declare import classes, load_plugin
 from kalmark.errors import ConfigError, KalmarkError
 
@@ -123,7 +123,7 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
         path = (*path, key)
         value = _at(tree.values, path)
         near = did_you_mean(key, keys)
-        message = f"got {context['what']} (value {show(value)}), expected {_one_of(keys)}{near}"
+        message = f"got {context['what']} (value {quote_value(value)}), expected {_one_of(keys)}{near}"
         return ConfigError(f"{tree.place(path, of_key=True)}: {'.'.join(path)}: {message}")
     value = _at(tree.values, path)
     if kind == "union_tag_invalid":
@@ -133,12 +133,12 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
         message = _not_one_of(value, re.findall(r"'([^']+)'", context["expected"]), path)
     elif kind == "union_tag_not_found":
         names = f": {_one_of(context['types'])}" if "types" in context else ""
-        message = f"got {show(value)}, expected a mapping with a type{names}"
+        message = f"got {quote_value(value)}, expected a mapping with a type{names}"
         if _kind(path) == "sensor":
             others = [name for name in _at(tree.values, path[:-1]) if name != path[-1]]
             message += did_you_mean(path[-1], others).replace("mean ", "mean the sensor ")
     else:
-        message = f"got {show(value)}, expected {_expected(kind, context, error['msg'])}"
+        message = f"got {quote_value(value)}, expected {_expected(kind, context, error['msg'])}"
     return ConfigError(f"{tree.place(path)}: {'.'.join(path)}: {message}")
 
 
@@ -176,8 +176,8 @@ def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
     kind = _kind(path[:-1])
     for here, there, world in (("space", "the plane", "plane"), ("the plane", "space", "space")):
         if kind == "sensor" and path[-1] == "type" and str(got) in classes("sensor", world):
-            return f"got {show(got)}, a sensor of {there} on a robot of {here}, expected {_one_of(words)}"
-    return f"got {show(got)}, expected {_one_of(words)}{did_you_mean(str(got), words)}"
+            return f"got {quote_value(got)}, a sensor of {there} on a robot of {here}, expected {_one_of(words)}"
+    return f"got {quote_value(got)}, expected {_one_of(words)}{did_you_mean(str(got), words)}"
 
 
 def _kind(path: tuple[str, ...]) -> str:

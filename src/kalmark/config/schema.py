@@ -21,9 +21,9 @@ from kalmark.config.sections import (
     Section,
     Sigmas,
     annotation,
-    expected,
     model_of,
     section_of,
+    unexpected_value,
     unknown_key,
 )
 from kalmark.config.tree import OVERRIDE, name_of
@@ -34,7 +34,7 @@ from kalmark.geometry.named_poses import world_of
 from kalmark.logs import known_formats
 from kalmark.logs.source import Format
 from kalmark.models.protocols import state_columns
-from kalmark.slam.description import STATES, known, sigma_of
+from kalmark.slam.description import STATES, sigma_of, state_names
 
 Motion = Annotated[Any, Choice("motion")]
 Estimator = Annotated[Any, Choice("estimator", default="invariant")]
@@ -226,7 +226,7 @@ class Mounted(ModelSection):
             return value
         preset = presets.ALL[value["preset"]]
         if cls.of_name != (name := registered_name(type(preset.sensor))):
-            raise expected(f"a preset of this type of sensor: {value['preset']} is a {name}", "preset")
+            raise unexpected_value(f"a preset of this type of sensor: {value['preset']} is a {name}", "preset")
         sensor = preset.in_space or preset.sensor
         of_it = {key: getattr(sensor, key) for key in preset.sources if key in cls.model_fields}
         return of_it | value
@@ -260,18 +260,18 @@ SpaceSensor = Annotated[Any, Choice("sensor", "space")]
 
 def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None:
     """Refuse values of a start for a state that its motion does not have.  Raises ValueError."""
-    has = known(state_columns(model_of(motion)), world_of(vars(start)))
+    has = state_names(state_columns(model_of(motion)), world_of(vars(start)))
     allowed = {*has, *(sigma_of(name)[0] for name in has)}
     if isinstance(start, SpaceStartConfig) and start.at_rest:
         if "bias_ax_mps2" not in has:
-            raise expected(f"false: {motion.type} has no inertial unit", "start", "at_rest")
+            raise unexpected_value(f"false: {motion.type} has no inertial unit", "start", "at_rest")
         if not np.all(_three(start.sigma_bias_a_mps2)):
-            raise expected("a number > 0: at rest a bias is taken for a tilt", "start", "sigma_bias_a_mps2")
+            raise unexpected_value("a number > 0: at rest a bias is taken for a tilt", "start", "sigma_bias_a_mps2")
     states = *STATES["plane"], *STATES["space"]
     for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
             what = next((word for word in ("slip", "bias", "gravity") if word in key), "velocity like this")
-            raise expected(f"0: {motion.type} has no {what} in its state", "start", key)
+            raise unexpected_value(f"0: {motion.type} has no {what} in its state", "start", key)
 
 
 def _three(sigma: float | tuple[float, ...]) -> Any:

@@ -39,7 +39,7 @@ from kalmark.declare import (
 )
 from kalmark.errors import ModelError
 from kalmark.events import MOST, is_number
-from kalmark.models.protocols import of_pair
+from kalmark.models.protocols import has_second_camera
 from kalmark.tracks.front_ends import SearchingDetector
 
 FAR = MOST["m"]
@@ -73,7 +73,7 @@ def unknown_key(key: str, what: str, keys: list[str]) -> PydanticCustomError:
     return PydanticCustomError("unknown_key", "unknown key", {"key": key, "what": what, "keys": keys})
 
 
-def expected(what: str, *below: str) -> PydanticCustomError:
+def unexpected_value(what: str, *below: str) -> PydanticCustomError:
     """Return the error of a value that should have been `what`; `below` leads from the section to that value."""
     return PydanticCustomError("expected", "{what}", {"what": what, "below": below})
 
@@ -83,7 +83,7 @@ def _sigmas(value: Any) -> float | tuple[float, ...]:
     if len(three) == 3 and all(is_number(v) and 0 <= v <= FAR for v in three):
         return tuple(map(float, three)) if isinstance(value, list | tuple) else float(value)
     far = f" and <= {FAR:.0e}" if any(is_number(v) and FAR < v < math.inf for v in three) else ""
-    raise expected(f"a number >= 0{far}, or a list of three: one for each axis")
+    raise unexpected_value(f"a number >= 0{far}, or a list of three: one for each axis")
 
 
 Sigmas = Annotated[float | tuple[float, ...], PlainValidator(_sigmas)]
@@ -94,7 +94,7 @@ def _linearity(value: Any) -> float | str:
         return "off"
     if is_number(value) and 0 < value < math.inf:
         return float(value)
-    raise expected("a number > 0, or off")
+    raise unexpected_value("a number > 0, or off")
 
 
 Linearity = Annotated[float | str, PlainValidator(_linearity)]
@@ -103,7 +103,7 @@ Linearity = Annotated[float | str, PlainValidator(_linearity)]
 def _robot(value: Any) -> int | str:
     if isinstance(value, str) or (isinstance(value, int) and not isinstance(value, bool)):
         return value
-    raise expected("a robot's name or number")
+    raise unexpected_value("a robot's name or number")
 
 
 RobotName = Annotated[int | str, PlainValidator(_robot)]
@@ -159,7 +159,7 @@ class Choice:
             model_of(section, self.world)
         except ModelError as error:
             if error.key:
-                raise expected(error.wanted, error.key) from None
+                raise unexpected_value(error.wanted, error.key) from None
         return section
 
     def validated(self, value: Any) -> Section:
@@ -173,7 +173,7 @@ class Choice:
             return self.made(name, value)
         missing = "".join(f"; {error}" for error in missing_models())
         if not self.names():
-            raise expected(f"nothing: no detector finds what this sensor measures{missing}")
+            raise unexpected_value(f"nothing: no detector finds what this sensor measures{missing}")
         if name is None:
             raise PydanticCustomError("union_tag_not_found", "no type", {"types": self.names()})
         raise PydanticCustomError("union_tag_invalid", "unknown type", {"types": self.names(), "missing": missing})
@@ -206,7 +206,7 @@ def finds(detector: Any, sensor: Any) -> bool:
     """
     if not (is_own(detector) and is_own(sensor)):
         return True
-    pair = issubclass(detector, SearchingDetector) and of_pair(sensor)
+    pair = issubclass(detector, SearchingDetector) and has_second_camera(sensor)
     return bool(pair or detector.columns[:2] == sensor.columns[:2])
 
 
@@ -258,7 +258,7 @@ def annotation(parameter: Parameter) -> Any:
         if wanted and parameter.type is None:
             raise PydanticCustomError("literal_error", "another word", {"expected": str(parameter.words)})
         if wanted:
-            raise expected(wanted)
+            raise unexpected_value(wanted)
         return tuple(value) if isinstance(value, list) else value
 
     return Annotated[Any, PlainValidator(validated)]

@@ -58,19 +58,19 @@ class Tree:
     def share(self, node: dict[str, Any], path: tuple[str, ...], name: str) -> None:
         """Lay the entry `name` of the mapping `node`, at `path`, over its `each`, which then was written there, too."""
         each, own = deepcopy(node[EACH]), node.get(name)
-        node[name] = each if own is None else merged(each, own) if isinstance(own, dict) else own
+        node[name] = each if own is None else merge_trees(each, own) if isinstance(own, dict) else own
         for table in (self.keys, self.places):
             for p in [p for p in table if p[: len(path) + 1] == (*path, EACH)]:
                 table.setdefault((*path, name, *p[len(path) + 1 :]), table[p])
 
 
-def merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def merge_trees(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """Return `below` with `above` laid over it, key by key; another `type` replaces its section, but for a mount."""
     other = "type" in above and above["type"] != below.get("type", above["type"])
     result = {key: value for key, value in below.items() if not other or key == "mount"}
     for key, value in above.items():
         old = result.get(key)
-        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+        result[key] = merge_trees(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
     return result
 
 
@@ -98,7 +98,7 @@ def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
     content = _parse(text, str(path))
     refuse_aliases(content, str(path), ConfigError)
     if not isinstance(content, CommentedMap) or not content:
-        got = "an empty file" if not content and not isinstance(content, int | float) else show(content)
+        got = "an empty file" if not content and not isinstance(content, int | float) else quote_value(content)
         raise ConfigError(f"{path}:1:1: got {got}, expected a mapping of keys")
     tree = Tree()
     tree.values = _plain(content, (), tree, str(path))
@@ -119,7 +119,7 @@ def tree_of(values: dict[str, Any], overrides: Sequence[str] = ()) -> Tree:
     return tree
 
 
-def show(value: Any) -> str:
+def quote_value(value: Any) -> str:
     """Return a value as an error message quotes it: short, on one line."""
     if value is None:
         return "nothing"
@@ -186,7 +186,7 @@ def _item(node: CommentedMap | CommentedSeq, key: Any, path: tuple[str, ...], tr
             line, column = rest
         tree.places[place] = f"{name}:{line + 1}:{column + 1}"
     if isinstance(node, CommentedMap) and (isinstance(key, bool) or not isinstance(key, str | int)):
-        raise ConfigError(f"{tree.place(place)}: got key {show(key)}, expected a text key")
+        raise ConfigError(f"{tree.place(place)}: got key {quote_value(key)}, expected a text key")
     return _plain(node[key], place, tree, name)
 
 
@@ -214,7 +214,7 @@ def _set(tree: Tree, node: dict[str, Any], path: tuple[str, ...], depth: int, va
             node[name] = {}
             tree.keys[here] = tree.places[here] = where
         if not isinstance(node[name], dict):
-            raise ConfigError(f"{where}: {'.'.join(here)}: got {show(node[name])}, expected a mapping of keys")
+            raise ConfigError(f"{where}: {'.'.join(here)}: got {quote_value(node[name])}, expected a mapping of keys")
         _set(tree, node[name], (*here, *path[depth + 1 :]), depth + 1, deepcopy(value), where)
 
 

@@ -28,7 +28,7 @@ def arrays(path: Path, names: tuple[str, ...]) -> dict[str, Array]:
     if not path.is_file():
         raise LogError(f"{path}: no such file, expected a MATLAB file with {', '.join(names)}")
     try:
-        content = matlab.numbers(path, names)
+        content = matlab.load_arrays(path, names)
     except (OSError, ValueError) as error:
         raise LogError(f"{path}: not a complete MATLAB file ({error}), expected one with {', '.join(names)}") from None
     out = {}

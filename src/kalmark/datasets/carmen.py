@@ -28,7 +28,7 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log
-from kalmark.logs.source import STEP_NS, Format, Request, nanoseconds, number, one_robot, rows
+from kalmark.logs.source import STEP_NS, Format, Request, nanoseconds_of_text, number_of_text, one_robot, text_rows
 from kalmark.logs.table_columns import BEAM, INCREMENT2
 
 ROBOT = "robot"
@@ -67,14 +67,14 @@ class _Reader:
             self.scan(tag, t_ns, cells[2 : 2 + n], -math.pi / 2, step, MOST_M)
             self.pose(t_ns, rest[3:6])
         elif tag in LASERS:
-            first, _, step, most = (number(cell) for cell in cells[2:6])
+            first, _, step, most = (number_of_text(cell) for cell in cells[2:6])
             n = int(cells[8])
             after = cells[9 + n :]
             rest = after[1 + int(after[0]) :]
-            self.scan(tag, nanoseconds(rest[11]), cells[9 : 9 + n], first, step, most)
-            self.pose(nanoseconds(rest[11]), rest[3:6])
+            self.scan(tag, nanoseconds_of_text(rest[11]), cells[9 : 9 + n], first, step, most)
+            self.pose(nanoseconds_of_text(rest[11]), rest[3:6])
         elif tag == "PARAM" and cells[1] in OFFSETS:
-            self.offsets[OFFSETS[cells[1]]] = number(cells[2])
+            self.offsets[OFFSETS[cells[1]]] = number_of_text(cells[2])
         elif tag != "PARAM":
             self.unread[tag] = self.unread.get(tag, 0) + 1
 
@@ -84,17 +84,17 @@ class _Reader:
             raise ValueError(f"a message {'with' if cells else 'without'} a time, expected all or none to have one")
         if cells:
             self.timed += 1
-            return nanoseconds(cells[0])
+            return nanoseconds_of_text(cells[0])
         self.steps += 1
         return self.steps * STEP_NS
 
     def pose(self, t_ns: int, cells: list[str]) -> None:
         """Take a pose of the odometry."""
-        self.odometry.setdefault(t_ns, np.array([number(cell) for cell in cells]))
+        self.odometry.setdefault(t_ns, np.array([number_of_text(cell) for cell in cells]))
 
     def scan(self, tag: str, t_ns: int, cells: list[str], first: float, step: float, most: float) -> None:
         """Take the beams of a scan that returned."""
-        r = np.array([number(cell) for cell in cells])
+        r = np.array([number_of_text(cell) for cell in cells])
         if (r < 0).any():
             raise ValueError(f"range {r.min()}, expected ranges of at least 0")
         y = np.column_stack([r, first + step * np.arange(len(r))])
@@ -122,7 +122,7 @@ class _Reader:
 def read(path: Path, request: Request) -> Log:
     """Return the log.  Raises LogError, with file and line."""
     reader = _Reader(path, request)
-    for line, cells in rows(path):
+    for line, cells in text_rows(path):
         try:
             reader.take(cells)
         except (ValueError, IndexError) as error:

@@ -38,7 +38,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, shown, unit_quaternion
+from kalmark.events import Control, Event, Id, Scan, short_text, unit_quaternion
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew
@@ -48,9 +48,9 @@ from kalmark.logs.source import (
     Format,
     Request,
     landmark_id,
-    number,
+    number_of_text,
     one_robot,
-    rows,
+    text_rows,
 )
 from kalmark.logs.table_columns import BEAM, INCREMENT2, INCREMENT3, POSITION
 
@@ -85,7 +85,7 @@ def information(cells: list[str], size: int) -> Array:
     if len(cells) != size * (size + 1) // 2:
         raise ValueError(f"{len(cells)} numbers of information, expected {size * (size + 1) // 2}")
     H = np.zeros((size, size))
-    H[np.triu_indices(size)] = [number(cell) for cell in cells]
+    H[np.triu_indices(size)] = [number_of_text(cell) for cell in cells]
     H = H + np.triu(H, 1).T
     np.linalg.cholesky(H)  # its LinAlgError is a ValueError
     C = np.linalg.inv(H)
@@ -96,7 +96,7 @@ def pose(cells: list[str], size: int) -> Array:
     """Return a pose (3,) or (7,), its quaternion normalised.  Raises ValueError."""
     if len(cells) != size:
         raise ValueError(f"{len(cells)} numbers of a pose, expected {size}")
-    values = np.array([number(cell) for cell in cells])
+    values = np.array([number_of_text(cell) for cell in cells])
     if len(values) == 7:
         values[3:] = unit_quaternion(values[3:], ValueError)
     return values
@@ -106,11 +106,11 @@ def pose_id(text: str) -> int:
     """Return the id of a pose, by which they are in order.  Raises ValueError."""
     found = landmark_id(text)
     if not isinstance(found, int):
-        raise ValueError(f"id {shown(text)} of a pose, expected a whole number")
+        raise ValueError(f"id {short_text(text)} of a pose, expected a whole number")
     return found
 
 
-def control(step: Array, C: Array) -> tuple[Array, Array]:
+def increment_of_edge(step: Array, C: Array) -> tuple[Array, Array]:
     """Return the increment of an edge (3,) or (7,), and its covariance from that of the edge's errors."""
     if len(step) == 3:
         c, s = np.cos(step[2]), np.sin(step[2])
@@ -147,12 +147,12 @@ def take(graph: Graph, tag: str, cells: list[str]) -> None:
         if tag in POSES:
             graph.poses[pose_id(cells[0])] = pose(cells[1:], size)
         else:
-            graph.places[landmark_id(cells[0])] = np.array([number(cell) for cell in cells[1:]])
+            graph.places[landmark_id(cells[0])] = np.array([number_of_text(cell) for cell in cells[1:]])
     elif tag in EDGES:
         _take_edge(graph, tag, cells)
     elif tag in SIGHTS:
         size, first = SIGHTS[tag], 3 if tag == "EDGE_SE3_TRACKXYZ" else 2
-        y = np.array([number(cell) for cell in cells[first : first + size]])
+        y = np.array([number_of_text(cell) for cell in cells[first : first + size]])
         C = information(cells[first + size :], size)
         if len(y) != size:
             raise ValueError(f"{len(cells)} cells, expected {first} ids, {size} numbers and their information")
@@ -178,7 +178,7 @@ def _take_edge(graph: Graph, tag: str, cells: list[str]) -> None:
         (a, b), (step, C) = (b, a), turned_round(step, C)
     if (a, b) in graph.moves:
         graph.left_out[f"{tag} lines of a pair of poses that has one already"] += 1
-    graph.moves.setdefault((a, b), control(step, C))
+    graph.moves.setdefault((a, b), increment_of_edge(step, C))
 
 
 def read(
@@ -190,7 +190,7 @@ def read(
 ) -> Log:
     """Return the log."""
     graph = Graph()
-    for line, (tag, *cells) in rows(path):
+    for line, (tag, *cells) in text_rows(path):
         try:
             take(graph, tag, cells)
         except (ValueError, IndexError) as error:

@@ -100,7 +100,7 @@ def names(path: Path) -> set[str]:
     return {head(content, order).name for order, content in elements(path, NAME_BYTES)}
 
 
-def numbers(path: Path, wanted: tuple[str, ...]) -> dict[str, Array]:
+def load_arrays(path: Path, wanted: tuple[str, ...]) -> dict[str, Array]:
     """Return those of the wanted arrays that there are, as float64.  Raises ValueError, OSError."""
     out = {}
     for order, content in elements(path, MOST_BYTES):

@@ -11,9 +11,9 @@ from typing import Annotated
 
 from kalmark.declare import Number
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, order, shown
+from kalmark.events import Control, Event, Id, Scan, short_text, sort_key
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Request, nearest, read_points, rows, timed_rows
+from kalmark.logs.source import Format, Request, read_points, spelling_hint, text_rows, timed_rows
 from kalmark.logs.table_columns import BEAM
 
 SENSOR = "camera"
@@ -51,7 +51,9 @@ def read(
     present = robots_in(path)
     for robot in request.robots or ():
         if robot not in present:
-            raise LogError(f"{path}: no robot {robot!r}, expected one of {', '.join(present)}{nearest(robot, present)}")
+            raise LogError(
+                f"{path}: no robot {robot!r}, expected one of {', '.join(present)}{spelling_hint(robot, present)}"
+            )
     shift_ns = round(bearing_shift_s * 1e9)
     subjects = read_barcodes(path / "Barcodes.dat", request)
     ignored = () if robot_sightings else MRCLAM_ROBOTS
@@ -72,7 +74,7 @@ def read(
             truth[robot] = read_truth(true, request)
     landmarks = path / "Landmark_Groundtruth.dat"
     return Log(
-        path.name, robots, sorted(events, key=order), "mrclam", path, truth,
+        path.name, robots, sorted(events, key=sort_key), "mrclam", path, truth,
         read_points(landmarks, request.refuse, int, (3, 4, 5), "subject, x, y and their deviations"),
         skipped=request.skipped, control_columns=dict.fromkeys(robots, ("v_mps", "w_radps")),
         sensor_columns={(robot, SENSOR): BEAM for robot in robots},
@@ -82,12 +84,12 @@ def read(
 def read_barcodes(path: Path, request: Request) -> dict[int, Id]:
     """Return the landmark id of each barcode: the subject's number, or the robot's name."""
     subjects: dict[int, Id] = {}
-    for line, cells in rows(path):
+    for line, cells in text_rows(path):
         try:
             subject, barcode = map(int, cells)
             subjects[barcode] = f"robot{subject}" if subject <= len(MRCLAM_ROBOTS) else subject
         except ValueError:
-            request.refuse(f"{path}:{line}: {shown(' '.join(cells))}, expected a subject and its barcode")
+            request.refuse(f"{path}:{line}: {short_text(' '.join(cells))}, expected a subject and its barcode")
     return subjects
 
 

@@ -15,9 +15,18 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.datasets.array_files import arrays
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, shown
+from kalmark.events import Control, Event, Id, Scan, short_text
 from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Refuse, Request, nanoseconds, number, one_robot, rows, timed_rows
+from kalmark.logs.source import (
+    Format,
+    Refuse,
+    Request,
+    nanoseconds_of_text,
+    number_of_text,
+    one_robot,
+    text_rows,
+    timed_rows,
+)
 from kalmark.logs.table_columns import INCREMENT2
 
 ROBOT, SENSOR = "robot", "radio"
@@ -38,20 +47,20 @@ def read(path: Path, request: Request) -> Log:
     """Return the log: an increment ends at its time, its turn is half before and half after its way."""
     name = path.name.removesuffix(ODOMETRY)
     steps = timed_rows(path, ("distance_m", "dtheta_rad"), request.refuse)
-    events: list[Event] = [Control(t_ns=t_ns, robot=ROBOT, u=increment(*u)) for _, t_ns, u in steps]
-    events += scans(path.with_name(name + RANGES), request)
+    events: list[Event] = [Control(t_ns=t_ns, robot=ROBOT, u=increment_at_middle(*u)) for _, t_ns, u in steps]
+    events += range_scans(path.with_name(name + RANGES), request)
     truth, beacons = read_truth(path.with_name(name + TRUTH))
     columns, sensors = INCREMENT2, {SENSOR: ("range_m",)}
     return one_robot("plaza", path.parent, request, ROBOT, events, columns, sensors,
                      name=name.lower(), truth=truth, landmarks=beacons)  # fmt: skip
 
 
-def increment(distance: float, turn: float) -> Array:
+def increment_at_middle(distance: float, turn: float) -> Array:
     """Return (dx, dy, dtheta) in the frame of the pose before."""
     return np.array([distance * np.cos(turn / 2), distance * np.sin(turn / 2), turn])
 
 
-def scans(path: Path, request: Request) -> Iterator[Scan]:
+def range_scans(path: Path, request: Request) -> Iterator[Scan]:
     """Return the ranges of each time; of a beacon that answered twice the second is left out and listed.
 
     The file is in pieces that overlap in time: their rows are sorted.
@@ -72,15 +81,16 @@ def ranges(path: Path, refuse: Refuse) -> Iterator[tuple[int, int, int, float]]:
     """Yield line, time, beacon and range of each row; bad rows go to `refuse`."""
     if not path.is_file():
         raise LogError(f"{path}: no such file, expected the ranges that belong to the odometry beside it")
-    for line, cells in rows(path):
+    for line, cells in text_rows(path):
         try:
             t, _, beacon, value = cells
-            row = line, nanoseconds(t), int(number(beacon)), number(value)
+            row = line, nanoseconds_of_text(t), int(number_of_text(beacon)), number_of_text(value)
             if row[3] < 0:
                 raise ValueError
         except ValueError:
             refuse(
-                f"{path}:{line}: {shown(' '.join(cells))}, expected time, receiver, beacon and a range of at least 0"
+                f"{path}:{line}: {short_text(' '.join(cells))}, "
+                "expected time, receiver, beacon and a range of at least 0"
             )
         else:
             yield row

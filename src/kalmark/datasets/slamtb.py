@@ -19,8 +19,8 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Scan, order
-from kalmark.files import read_arrays, unpacked
+from kalmark.events import Control, Event, Scan, sort_key
+from kalmark.files import read_arrays, unpack_file
 from kalmark.geometry.gaussian import sigma_probability
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.log import Log, Trajectory
@@ -60,18 +60,18 @@ def read(path: Path, request: Request) -> Log:
     Raises LogError if the file is cut or something is missing in it.
     """
     try:
-        content = json.loads(b"".join(unpacked(path, LogError)))
+        content = json.loads(b"".join(unpack_file(path, LogError)))
     except ValueError as error:
         raise LogError(f"{path}: cannot be read ({error}), expected a whole recording") from None
     try:
-        return recording(path, content, request)
+        return log_of_recording(path, content, request)
     except KeyError as error:
         raise LogError(f"{path}: no {error.args[0]!r} in it, expected a recording of the Matlab toolbox") from None
     except (TypeError, IndexError, ValueError) as error:
         raise LogError(f"{path}: {error}, expected a recording of the Matlab toolbox") from None
 
 
-def recording(path: Path, content: dict[str, Any], request: Request) -> Log:
+def log_of_recording(path: Path, content: dict[str, Any], request: Request) -> Log:
     """Return the log of a recording that has been parsed."""
     cfg, lines = content["cfg"], is_lines(content["cfg"])
     robots = parts("robot", cfg["Robot"])
@@ -85,27 +85,27 @@ def recording(path: Path, content: dict[str, Any], request: Request) -> Log:
     things = cfg["SimLmk"]["segments" if lines else "points"]  # points (3,) or both ends of segments (6,)
     gate = sigma_probability(math.sqrt(cfg["Opt"]["correct"]["MD2th"]), 2)  # the toolbox's is on d^2 of two numbers
     return Log(
-        str(cfg["name"]), tuple(robot.name for robot in robots), sorted(events, key=order), NAME, path, truth,
-        landmarks=dict(zip(*numbered(things["id"], things["coord"], 6 if lines else 3), strict=True)),
+        str(cfg["name"]), tuple(robot.name for robot in robots), sorted(events, key=sort_key), NAME, path, truth,
+        landmarks=dict(zip(*ids_and_columns(things["id"], things["coord"], 6 if lines else 3), strict=True)),
         skipped=request.skipped, reference=reference,
         control_columns={robot.name: CONTROLS[robot.settings["motion"]] for robot in robots},
         sensor_columns=dict.fromkeys(sorted(seen), SEGMENTS if lines else POINTS),
-        describes=described(cfg, robots) | {"association": {"type": "identity", "gate": gate}},
+        describes=configuration(cfg, robots) | {"association": {"type": "identity", "gate": gate}},
     )  # fmt: skip
 
 
 def frame_events(frame: dict[str, Any], t_ns: int, lines: bool) -> Iterator[Event]:
     """Yield the control of each robot in one frame, and what each of its sensors saw."""
-    for robot in listed(frame["rob"]):
+    for robot in as_list(frame["rob"]):
         name = f"robot{robot['rob']}"
         yield Control(t_ns=t_ns, robot=name, u=robot["u"])
-        for sensor in listed(robot["sen"]):
+        for sensor in as_list(robot["sen"]):
             kind, size = ("seg", 4) if lines else ("pnt", 2)
-            ids, y = numbered(sensor[f"{kind}_ids"], sensor[kind], size)
+            ids, y = ids_and_columns(sensor[f"{kind}_ids"], sensor[kind], size)
             yield Scan(t_ns=t_ns, robot=name, sensor=f"camera{sensor['sen']}", y=y, ids=ids)
 
 
-def numbered(ids: Any, matrix: Any, size: int) -> tuple[list[int], Array]:
+def ids_and_columns(ids: Any, matrix: Any, size: int) -> tuple[list[int], Array]:
     """Return K ids and the columns of a recorded matrix (size, K) as (K, size).
 
     The recording has a bare number and a flat list for K = 1, [] for K = 0.
@@ -141,7 +141,7 @@ def tracks(
     return paths, {NAME: figures | {"pose_nees_median": float(np.nanmedian(nees))}}
 
 
-def listed(value: Any) -> list[Any]:
+def as_list(value: Any) -> list[Any]:
     """Return a list; the recording may have its only element bare."""
     return value if isinstance(value, list) else [value]
 
@@ -158,7 +158,7 @@ class Part:
 
 def parts(word: str, settings: Any) -> list[Part]:
     """Return the robots or sensors of a recording, named by their numbers: robot1, robot2, ..."""
-    return [Part(f"{word}{i + 1}", i, one) for i, one in enumerate(listed(settings))]
+    return [Part(f"{word}{i + 1}", i, one) for i, one in enumerate(as_list(settings))]
 
 
 def is_lines(cfg: dict[str, Any]) -> bool:
@@ -166,7 +166,7 @@ def is_lines(cfg: dict[str, Any]) -> bool:
     return str(cfg["Opt"]["init"]["initType"]).endswith("Lin")
 
 
-def described(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
+def configuration(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
     """Return the configuration with which kalmark repeats a recording, its landmark type included."""
     opt, ends = cfg["Opt"], {}
     if is_lines(cfg):  # what becomes of the segment that is kept beside a line
@@ -174,16 +174,16 @@ def described(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
         ends = {"extend": bool(lines["extPolicy"]), "switch_px": float(lines["extSwitch"])}
     return {
         "robots": {robot.name: described_robot(cfg, robot) for robot in robots},
-        "landmarks": landmark(opt["init"]) | ends,
+        "landmarks": landmark_type(opt["init"]) | ends,
         "map": {"reparametrize": float(opt["correct"]["linTestIdp"]) if opt["correct"]["reparametrize"] else "off"},
     }
 
 
-def landmark(init: dict[str, Any]) -> dict[str, Any]:
+def landmark_type(init: dict[str, Any]) -> dict[str, Any]:
     """Return the landmark type of a recording, with the prior of what one image does not tell."""
     kind = init["initType"]
     prior = init["plkLin" if kind in PLUECKER else "idpPnt"]
-    mean, sigma = numbers(prior["nonObsMean"]), numbers(prior["nonObsStd"])
+    mean, sigma = as_vector(prior["nonObsMean"]), as_vector(prior["nonObsStd"])
     section: dict[str, Any] = {"type": LANDMARKS[kind]}
     if kind in PLUECKER:
         names = ("prior_beta_1", "prior_beta_2", "sigma_beta_1", "sigma_beta_2")
@@ -196,8 +196,8 @@ def described_robot(cfg: dict[str, Any], robot: Part) -> dict[str, Any]:
     sensors = [one for one in parts("camera", cfg["Sensor"]) if one.settings["robot"] == robot.index + 1]
     return {
         "motion": motion(robot.settings["motion"], np.array(cfg["RobU"][robot.index])),
-        "start": start(robot.settings, np.array(cfg["RobX0"][robot.index], dtype=np.float64)),
-        "sensors": {sensor.name: camera(cfg, sensor) for sensor in sensors},
+        "start": start_section(robot.settings, np.array(cfg["RobX0"][robot.index], dtype=np.float64)),
+        "sensors": {sensor.name: camera_section(cfg, sensor) for sensor in sensors},
     }
 
 
@@ -211,20 +211,20 @@ def motion(kind: str, noise: Array) -> dict[str, Any]:
     return {"type": "odometry_3d", **along, "sigma_rotation_rad": turn}
 
 
-def start(settings: dict[str, Any], state: Array) -> dict[str, Any]:
+def start_section(settings: dict[str, Any], state: Array) -> dict[str, Any]:
     """Return where a robot starts; standard deviations of roll, pitch and yaw are taken about x, y and z."""
     section: dict[str, Any] = describe_pose(state[WXYZ_TO_XYZW]) | {
-        "sigma_position_m": numbers(settings["positionStd"]),
-        "sigma_rotation_deg": numbers(settings["orientationStd"]),
+        "sigma_position_m": as_vector(settings["positionStd"]),
+        "sigma_rotation_deg": as_vector(settings["orientationStd"]),
     }
     if len(state) == 13:
         section |= dict(zip(TWIST3, state[7:].tolist(), strict=True))
-        section |= {"sigma_v_mps": numbers(settings["velStd"])}
+        section |= {"sigma_v_mps": as_vector(settings["velStd"])}
         section |= {"sigma_w_radps": np.radians(settings["angVelStd"]).tolist()}
     return section
 
 
-def camera(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
+def camera_section(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
     """Return the section of one camera: its model, mount, and which landmarks of an image it takes."""
     settings, opt = sensor.settings, cfg["Opt"]
     width, height = settings["imageSize"]
@@ -232,19 +232,19 @@ def camera(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
     section: dict[str, Any] = {"type": "pinhole", "cx_px": k[0], "cy_px": k[1]}
     if settings["type"] == "omniCam":
         section |= {"type": "omnidirectional", "c": k[2], "d": k[3], "e": k[4]}
-        section["projection"] = numbers(settings["distortion"])
-        section["back_projection"] = numbers(settings["invDistortion"])
+        section["projection"] = as_vector(settings["distortion"])
+        section["back_projection"] = as_vector(settings["invDistortion"])
     else:
         section |= {"fx_px": k[2], "fy_px": k[3]}
         if is_lines(cfg):
             section |= {"type": "segments", "min_length_px": float(opt["obs"]["lines"]["minLength"])}
         else:
-            section |= {"lens": "radial", "distortion": numbers(settings["distortion"])}
+            section |= {"lens": "radial", "distortion": as_vector(settings["distortion"])}
     section |= {"width_px": int(width), "height_px": int(height), "sigma_px": float(settings["pixErrorStd"])}
     mount: dict[str, Any] = describe_pose(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
     if settings["frameInMap"]:
-        mount |= {"sigma_position_m": numbers(settings["positionStd"])}
-        mount |= {"sigma_rotation_deg": numbers(settings["orientationStd"])}
+        mount |= {"sigma_position_m": as_vector(settings["positionStd"])}
+        mount |= {"sigma_rotation_deg": as_vector(settings["orientationStd"])}
     first, later = opt["init"]["nbrInits"]
     attention = {  # which landmarks of an image the toolbox corrects, starts and gives up
         "updates": int(opt["correct"]["nUpdates"]), "starts": int(later), "first_starts": int(first),
@@ -254,7 +254,7 @@ def camera(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
     return section | {"mount": mount, "attention": attention}
 
 
-def numbers(value: Any) -> list[float]:
+def as_vector(value: Any) -> list[float]:
     """Return a vector, which the recording has bare if it is of one element."""
     return np.atleast_1d(np.asarray(value, dtype=np.float64)).tolist()
 

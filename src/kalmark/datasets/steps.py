@@ -26,7 +26,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import Within
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, shown
+from kalmark.events import Control, Event, Id, Scan, short_text
 from kalmark.logs.log import Log
 from kalmark.logs.source import (
     STEP_NS,
@@ -34,10 +34,10 @@ from kalmark.logs.source import (
     Request,
     file_in,
     landmark_id,
-    number,
+    number_of_text,
     one_robot,
     read_points,
-    rows,
+    text_rows,
 )
 from kalmark.logs.table_columns import BEAM, INCREMENT2, POSITION
 
@@ -71,12 +71,12 @@ def events_of(
 ) -> list[Event]:
     """Return the events of a file whose lines `read` turns into records (None: left out); ValueError refuses a line."""
     steps: list[tuple[Record, list[Record]]] = []
-    for line, cells in rows(path):
+    for line, cells in text_rows(path):
         where = f"{path}:{line}"
         try:
             record = read(where, cells)
         except ValueError:
-            request.refuse(f"{where}: {shown(' '.join(cells))}, expected {expected}")
+            request.refuse(f"{where}: {short_text(' '.join(cells))}, expected {expected}")
             continue
         if record is None:
             continue
@@ -117,9 +117,9 @@ def read_dlr(
 def dlr_record(where: str, cells: list[str], scale: float) -> Record:
     """Return one line of the DLR set, both sorts with three numbers and a covariance.  Raises ValueError."""
     if cells[0] == "STEP" and len(cells) == 11:
-        n, values, id_ = 3, [number(cell) for cell in cells[2:]], None
+        n, values, id_ = 3, [number_of_text(cell) for cell in cells[2:]], None
     elif cells[0] in ("LANDMARK_C", "LANDMARK") and len(cells) == 8:
-        n, values, id_ = 2, [number(cell) for cell in cells[1:7]], landmark_id(cells[7])
+        n, values, id_ = 2, [number_of_text(cell) for cell in cells[1:7]], landmark_id(cells[7])
     else:
         raise ValueError
     m, cov = M[:n, :n], np.array(values[3:])[ORDER[:n, :n]]
@@ -145,9 +145,9 @@ def freiburg_record(where: str, cells: list[str], request: Request) -> Record | 
     kind, first, *rest = cells
     if kind not in ("ODOMETRY", "SENSOR") or len(rest) != 2:
         raise ValueError
-    a, b = map(number, rest)
+    a, b = map(number_of_text, rest)
     if kind == "ODOMETRY":
-        r1 = number(first)
+        r1 = number_of_text(first)
         return Record(True, (a * math.cos(r1), a * math.sin(r1), r1 + b))
     if a < 0:
         request.skipped.append(f"{where}: range is {a}, expected a range of at least 0")

@@ -35,7 +35,9 @@ STARRY = (
 KITTI = ("features", "time_stamps", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
 
 
-def described(camera: tuple[Any, ...], size: tuple[int, int], pixels: Any, mount: Array, rates: Any) -> dict[str, Any]:
+def robot_section(
+    camera: tuple[Any, ...], size: tuple[int, int], pixels: Any, mount: Array, rates: Any
+) -> dict[str, Any]:
     """Return the section of a robot: `camera` has fx, fy, cx, cy and the baseline, `pixels` and `rates` the sigmas."""
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")
     stereo = {"type": "stereo"} | dict(zip(names, map(float, camera), strict=True))
@@ -45,7 +47,7 @@ def described(camera: tuple[Any, ...], size: tuple[int, int], pixels: Any, mount
     return {"motion": {"type": "velocity_3d"} | motion, "sensors": {SENSOR: stereo | {"mount": describe_pose(mount)}}}
 
 
-def log_of(
+def log_of_features(
     format: str, path: Path, request: Request, robot: str, t_ns: Any, u: Array, y: Array, seen: Any, section: Any,
     first: int = 0, **rest: Any
 ) -> Log:  # fmt: skip
@@ -74,9 +76,9 @@ def read_starry_night(path: Path, request: Request) -> Log:
     turns = Rotation.from_rotvec(data["theta_vk_i"].T).as_quat()
     camera = tuple(data[name].item() for name in ("fu", "fv", "cu", "cv", "b"))
     mount, sigmas = frame(data["rho_v_c_v"], data["C_c_v"].T), np.vstack([data["v_var"], data["w_var"]])
-    section = described(camera, (640, 480), np.sqrt(data["y_var"].reshape(-1)), mount, np.sqrt(sigmas.reshape(-1)))
+    section = robot_section(camera, (640, 480), np.sqrt(data["y_var"].reshape(-1)), mount, np.sqrt(sigmas.reshape(-1)))
     u, y = np.vstack([data["v_vk_vk_i"], data["w_vk_vk_i"]]).T, data["y_k_j"].swapaxes(1, 2)
-    return log_of(
+    return log_of_features(
         "starry_night", path, request, "robot", t_ns, u, y, (y >= 0).all(axis=0), section, 1,
         truth={"robot": Trajectory(t_ns, np.column_stack([data["r_i_vk_i"].T, turns]))},
         landmarks={i + 1: position for i, position in enumerate(data["rho_i_pj_i"].T)},
@@ -126,8 +128,10 @@ def read_kitti(
         request.leave_out(left_out, f"{path}: {left_out} observations with a disparity below {min_disparity_px:g} px")
     camera = K[0, 0], K[1, 1], K[0, 2], K[1, 2], data["b"]
     mount = frame(T[:3, 3], T[:3, :3].T)
-    section = described(camera, (1242, 375), [0.5] * 4, mount, SIGMAS_OF_KITTI)
-    return log_of("kitti_stereo_features", path, request, "car", t_ns, u, y, near, section, name=f"kitti_{path.stem}")
+    section = robot_section(camera, (1242, 375), [0.5] * 4, mount, SIGMAS_OF_KITTI)
+    return log_of_features(
+        "kitti_stereo_features", path, request, "car", t_ns, u, y, near, section, name=f"kitti_{path.stem}"
+    )
 
 
 STARRY_NIGHT = Format("starry_night", f"{FILE} or its folder", partial(find_variables, FILE, STARRY), read_starry_night)

@@ -18,7 +18,7 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.files import refuse_bomb
 from kalmark.logs.log import Log, PositionTrack, Times
-from kalmark.logs.source import Format, Request, folder_of, nanoseconds, one_robot, read_text, timed_rows
+from kalmark.logs.source import Format, Request, folder_of, nanoseconds_of_text, one_robot, read_text, timed_rows
 from kalmark.logs.table_columns import BEAM
 
 ROBOT, SENSOR = "car", "laser"
@@ -116,7 +116,7 @@ def laser_scans(path: Path) -> list[Event]:
         raise LogError(f"{file}: {len(cells)} numbers, expected whole scans of a time and {BEAMS} ranges")
     try:
         table = np.array(cells, dtype=np.float64).reshape(-1, BEAMS + 1)
-        t_ns = [nanoseconds(cell) + ASCII_BEHIND_NS for cell in cells[:: BEAMS + 1]]
+        t_ns = [nanoseconds_of_text(cell) + ASCII_BEHIND_NS for cell in cells[:: BEAMS + 1]]
     except ValueError as error:
         raise LogError(f"{file}: {error}, expected numbers") from None
     r = table[:, 1:]

@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import Positive, register
 from kalmark.errors import EventError, ModelError
-from kalmark.events import Frame, Scan, when
+from kalmark.events import Frame, Scan, label_of_event
 from kalmark.models.sensors import TagCorners
 
 Family = Literal["16h5", "25h9", "36h10", "36h11"]
@@ -70,5 +70,5 @@ class Tags:
         try:
             y, ids = self.detect(image)
         except EventError as error:
-            raise EventError(f"{when(scan)}: {error}") from None
+            raise EventError(f"{label_of_event(scan)}: {error}") from None
         return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=y if ids else (), ids=ids or None)

@@ -46,7 +46,7 @@ class Walls(Laser):
         pieces, _ = self.pieces(r, a)
         least = max(self.beams, 2 * TRIM + 3)
         beams = straight_pieces(r, a, pieces, self.split_m, least)
-        beams = grown(r, a, beams, self.sigma_range_m**2, least)
+        beams = refine_pieces(r, a, beams, self.sigma_range_m**2, least)
         u, P, chi2 = lines(r, a, beams, self.sigma_range_m**2, TRIM)
         at = a[beams] - u[:, 1:]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -196,7 +196,7 @@ def fit_line(r: Array, a: Array, variance: float) -> tuple[Array, Array, float]:
 
 
 @compiled
-def grown(r: Array, a: Array, pieces: Index, variance: float, beams: int) -> Index:
+def refine_pieces(r: Array, a: Array, pieces: Index, variance: float, beams: int) -> Index:
     """Return the pieces (S, 2) with their ends put right, in the order of the beams: a cut is rarely at the corner.
 
     The longest first, the line through the middle of each takes the beams beside it as far as they lie on it.

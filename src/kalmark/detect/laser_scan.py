@@ -12,7 +12,7 @@ from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.declare import Limit, NotNegative, Within, declared
 from kalmark.errors import EventError
-from kalmark.events import Scan, when
+from kalmark.events import Scan, label_of_event
 
 TURN = 2.01 * math.pi
 Acute = Annotated[float, Within(gt=0, lt=90)]
@@ -97,13 +97,15 @@ class Laser:
         if not len(scan.y):
             return scan
         if scan.y.shape[1] not in (2, 3):
-            raise EventError(f"{when(scan)}: y has {scan.y.shape[1]} columns, expected beams: {', '.join(RAW)}")
+            raise EventError(
+                f"{label_of_event(scan)}: y has {scan.y.shape[1]} columns, expected beams: {', '.join(RAW)}"
+            )
         if len(scan.y) < 3:
             return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor)
         try:
             found = self.detect(*scan.y.T)
         except EventError as error:
-            raise EventError(f"{when(scan)}: {error}") from None
+            raise EventError(f"{label_of_event(scan)}: {error}") from None
         size = max(self.given, 3 if self.signature else 0)
         y, cov = found.y[:, :size], found.cov[:, :size, :size]
         return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=y, cov=cov if len(y) else None)

@@ -11,21 +11,21 @@ from scipy.special import chdtrc
 
 from kalmark.arrays import Array
 from kalmark.batch.batch_state import BatchState, Ints
-from kalmark.batch.data import Associations, BatchInput, replayed
+from kalmark.batch.data import Associations, BatchInput, replay_events
 from kalmark.batch.problem import Problem
 from kalmark.batch.solver import Batch, optimum
 from kalmark.diagnosis import repeated_events
 from kalmark.diagnosis.cause_search import Search
 from kalmark.diagnosis.error_columns import Where
-from kalmark.diagnosis.gross_mistakes import MISFIT, filtered, fit
+from kalmark.diagnosis.gross_mistakes import MISFIT, filter_events, fit_of_run
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.mistakes import with_value
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.models.sensors import Wall
-from kalmark.results.batch import filtered_map, given_by
-from kalmark.results.measures import cut_off
+from kalmark.results.batch import batch_input, filtered_map
+from kalmark.results.measures import truncated_variance
 from kalmark.results.run import Run
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
@@ -50,54 +50,54 @@ class Searched(NamedTuple):
     pulled: bool = False
 
 
-def searched(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
+def search_causes(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
     """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none.
 
     Where `most` observations do not solve it, more are tried, up to a `limit`: all of a long log take minutes.
     """
-    every = calibrated(run, once(run, given_by(run)))
+    every = apply_calibration(run, remove_copies(run, batch_input(run)))
     if not every.associations.landmark:
         raise KalmarkError("no observation was of a landmark in the map")
-    given = thinned(run, every, most)
+    given = subsample(run, every, most)
     try:
-        problem = replayed(given, log)
+        problem = replay_events(given, log)
         batch = optimum(problem, tolerance=NEAR)
     except KalmarkError:
         if given is not every and min(MORE * most, len(every.associations.landmark)) <= limit:
-            return searched(run, log, MORE * most, limit, progress)
-        found = searched_robustly(run, log, thinned(run, regated(run, log, every), most), progress)
+            return search_causes(run, log, MORE * most, limit, progress)
+        found = searched_robustly(run, log, subsample(run, filter_with_gate(run, log, every), most), progress)
         if found is None:
             raise
         return found
-    search = Search(Linear.of(problem, batch.state, within_gates(run)), sensors_of(run), given.t_ns)
+    search = Search(Linear.of(problem, batch.state, gated_noise_factors(run)), sensors_of(run), given.t_ns)
     search.run(progress)
-    if any(f.rows is not None for f in search.found) and fit(run).mean > MISFIT:  # they have pulled the solution
-        again = searched_robustly(run, log, thinned(run, regated(run, log, every), most), progress)
+    if any(f.rows is not None for f in search.found) and fit_of_run(run).mean > MISFIT:  # they have pulled the solution
+        again = searched_robustly(run, log, subsample(run, filter_with_gate(run, log, every), most), progress)
         return again or Searched(search, batch, given)
     return Searched(search, batch, given)
 
 
 def searched_robustly(run: Run, log: Log, given: BatchInput, progress: bool) -> Searched | None:
     """Search for causes from a robust solution, with what is far off there taken out first; None if it has none."""
-    problem = replayed(given, log)
+    problem = replay_events(given, log)
     batch = robust(problem, problem.start)
     if batch is None:
         return None
-    search = Search(Linear.of(problem, batch.state, within_gates(run)), sensors_of(run), given.t_ns)
+    search = Search(Linear.of(problem, batch.state, gated_noise_factors(run)), sensors_of(run), given.t_ns)
     search.take_outliers()
     search.run(progress)
     return Searched(search, batch, given, pulled=True)
 
 
-def regated(run: Run, log: Log, given: BatchInput) -> BatchInput:
+def filter_with_gate(run: Run, log: Log, given: BatchInput) -> BatchInput:
     """Return it with the path and the map of the log filtered again with a gate: what is far off pulls these less."""
     if (run.config.get("association") or {}).get("type") != "identity":
         return given
     gated = with_value(run.config, ("association",), {"type": "identity", "gate": GATE})
-    again = filtered(gated, log, log.events)
+    again = filter_events(gated, log, log.events)
     if again is None or not np.array_equal(again.history.t_ns, given.t_ns):
         return given
-    return replace(given, poses=given_by(again).poses, landmarks={**given.landmarks, **filtered_map(again)})
+    return replace(given, poses=batch_input(again).poses, landmarks={**given.landmarks, **filtered_map(again)})
 
 
 def robust(problem: Problem, state: BatchState) -> Batch | None:
@@ -111,9 +111,9 @@ def robust(problem: Problem, state: BatchState) -> Batch | None:
     return found
 
 
-def once(run: Run, given: BatchInput) -> BatchInput:
+def remove_copies(run: Run, given: BatchInput) -> BatchInput:
     """Return it without the scans that are copies of the one before."""
-    twice = np.unique(run.history.step[repeated_events.of_scans(run)])
+    twice = np.unique(run.history.step[repeated_events.repeated_scans(run)])
     used = given.associations
     rows = np.flatnonzero(~np.isin(used.scan, twice))
     return given if len(rows) == len(used.scan) else replace(given, associations=_rows(used, rows))
@@ -124,16 +124,16 @@ def _rows(used: Associations, rows: Ints) -> Associations:
     return Associations(used.scan[rows], used.sensor[rows], used.index[rows], names, used.e[rows])
 
 
-def calibrated(run: Run, given: BatchInput) -> BatchInput:
+def apply_calibration(run: Run, given: BatchInput) -> BatchInput:
     """Return it with the mounts, ranges and controls that calibrate themselves as they were in the end."""
     slam, robots = run.final_slam(), {}
     for name, robot in given.robots.items():
-        sensors = {key: _calibrated(slam, f"{name}.{key}", mount) for key, mount in robot.sensors.items()}
+        sensors = {key: _mount_in_map(slam, f"{name}.{key}", mount) for key, mount in robot.sensors.items()}
         robots[name] = replace(robot, sensors=sensors)
     return replace(given, robots=robots, biases={bias.robot: bias.mean for bias in run.history.biases})
 
 
-def _calibrated(slam: Slam, name: str, mount: Mount) -> Mount:
+def _mount_in_map(slam: Slam, name: str, mount: Mount) -> Mount:
     """Return a mount as it is in the map, if it is there."""
     if mount.block(name) is None:
         return mount
@@ -152,7 +152,7 @@ def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
     return found
 
 
-def within_gates(run: Run) -> dict[Where, Array]:
+def gated_noise_factors(run: Run) -> dict[Where, Array]:
     """Return by what factor (p,) the noise that a sensor's gate leaves is smaller than that of all its observations.
 
     A gate leaves innovations of covariance k Z (`cut_off`).  Their noise has then R - (1 - k) R Z^-1 R, of which the
@@ -162,7 +162,7 @@ def within_gates(run: Run) -> dict[Where, Array]:
     robots = h.robot[h.step]
     for key, channel in run.final_slam().state.channels.items():
         mine = (h.outcome == "associated") & (robots == key[0]) & (h.sensor == key[1])
-        k = cut_off(channel.gate, channel.dof)
+        k = truncated_variance(channel.gate, channel.dof)
         if k < 1.0 and mine.any():
             share = h.noise[mine] ** 2 / np.diagonal(h.Z[mine], axis1=1, axis2=2)
             share = share[:, np.isfinite(share).any(axis=0)]
@@ -170,7 +170,7 @@ def within_gates(run: Run) -> dict[Where, Array]:
     return found
 
 
-def thinned(run: Run, given: BatchInput, most: int) -> BatchInput:
+def subsample(run: Run, given: BatchInput, most: int) -> BatchInput:
     """Return about `most` of the observations: segments of successive scans, evenly over the run.
 
     Those with the scans that fit least are among them, if these do not fit by chance: a jump is a single step.
@@ -203,7 +203,7 @@ def thinned(run: Run, given: BatchInput, most: int) -> BatchInput:
 
 def misfits(run: Run) -> tuple[Array, Ints]:
     """Return the chi-square (S,) of each scan, and those that do not fit by chance, the worst first."""
-    h, now = run.history, fit(run)
+    h, now = run.history, fit_of_run(run)
     chi2, dof = (np.bincount(h.step, of, len(h.t_ns)).astype(np.float64) for of in (now.values * now.dof, now.dof))
     bad = np.flatnonzero(chdtrc(np.maximum(dof, 1), chi2) * len(dof) < SELDOM)
     return chi2, bad[np.argsort(-chi2[bad])]

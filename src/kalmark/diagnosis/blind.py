@@ -7,7 +7,7 @@ from dataclasses import replace
 from kalmark.config.schema import TRUTH
 from kalmark.logs.log import Log, Trajectory, begins_at
 from kalmark.models.protocols import coasts
-from kalmark.results.batch import log_of
+from kalmark.results.batch import log_of_run
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
 
@@ -19,7 +19,7 @@ def blind(run: Run) -> tuple[Run, Log]:
     configuration states no start, and the landmarks of ``map.known: truth``.  Raises KalmarkError if the log of the run
     cannot be read again.
     """
-    slam, source = run.final_slam(), log_of(run)
+    slam, source = run.final_slam(), log_of_run(run)
     log = source if isinstance(source, Log) else Log(run.log.name, run.log.robots, list(source))
     stripped = log.without_truth()
     size, starts = run.truth.poses.shape[1], dict[str, Trajectory]()

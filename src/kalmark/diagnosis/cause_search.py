@@ -11,12 +11,12 @@ import numpy as np
 from scipy.special import bdtrc
 
 from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import LANDMARKS, looked
+from kalmark.batch.batch_state import LANDMARKS, innovations_and_jacobians
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import Finding
-from kalmark.diagnosis.error_columns import Where, columns_of, of_all_sensors, rates_of
+from kalmark.diagnosis.error_columns import Where, columns_of, errors_of_all_sensors, rates_of
 from kalmark.diagnosis.linear import OUT, Linear
-from kalmark.diagnosis.turned_mounts import turned
+from kalmark.diagnosis.turned_mounts import find_turned_mounts
 from kalmark.logs.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
@@ -34,7 +34,7 @@ LOOKED_AT, DRAWS = 200, 40  # outliers whose landmarks are looked for, and draws
 MANY = 0.3  # of the outliers, beyond chance, are of another landmark: it pulls its scan, and what is right is off, too
 
 
-def best(sure: list[Finding]) -> list[Finding]:
+def strongest_findings(sure: list[Finding]) -> list[Finding]:
     """Return what explains most, and what explains as much after it.
 
     Surveys that are off go before outliers and noise that would take them up, which are one for all of them, landmarks
@@ -119,7 +119,7 @@ class Search:
             if not sure or (lasting and not any(f.overstated for f in sure)):
                 break
             some = harmful or [f for f in sure if f.overstated]
-            first, *alike = best(some)
+            first, *alike = strongest_findings(some)
             first = self._of_its_name(first, some)
             self.take(replace(first, alike=tuple(alike)))
         for finding in self.correlated():
@@ -156,13 +156,13 @@ class Search:
         """Return all that may explain what is left."""
         columns = columns_of(self.linear, self.sensors, self.rates)
         return [
-            *causes.systematic(self.linear, [*columns, *of_all_sensors(columns)]),
+            *causes.systematic(self.linear, [*columns, *errors_of_all_sensors(columns)]),
             *causes.noise(self.linear, self.simulated, self.sensors),
             *causes.outliers(self.linear, self.t_s),
-            *causes.landmarks(self.linear, self.t_s),
+            *causes.moving_landmarks(self.linear, self.t_s),
             *causes.jumps(self.linear, self.t_s),
             *causes.priors(self.linear, self.t_s),
-            *turned(self.linear, self.t_s),
+            *find_turned_mounts(self.linear, self.t_s),
         ]
 
     def take(self, finding: Finding) -> None:
@@ -193,14 +193,14 @@ class Search:
         same = [c for c in every if mine and c is not mine and c.group == mine.group]
         if mine is None or not same:
             return finding
-        I = causes.together(self.linear, [mine, *same])[1]
+        I = causes.joint_errors(self.linear, [mine, *same])[1]
         told = [0]
         for k in range(1, len(I)):
             part = I[np.ix_([*told, k], [*told, k])]
             scaled = part / np.sqrt(np.outer(part.diagonal(), part.diagonal()))
             if np.linalg.cond(scaled) < MOST_CONDITION and np.linalg.inv(scaled)[0, 0] < 1.0 / (1.0 - ALIKE**2):
                 told.append(k)
-        s, _ = causes.together(self.linear, [(mine, *same)[k] for k in told])
+        s, _ = causes.joint_errors(self.linear, [(mine, *same)[k] for k in told])
         for k, value in zip(told, s, strict=True):
             column = (mine, *same)[k]
             self.linear = self.linear.without(column.Z * value, column.W * value)
@@ -243,7 +243,7 @@ class Search:
             z = np.empty((len(mine), len(places), p))  # of all landmarks, whitened as of the own one
             for i, row in enumerate(mine.tolist()):
                 rows, R = np.full(len(places), row), factor.R[row] * np.outer(noise[row], noise[row])
-                off, _ = looked(factor.view, poses[blocks[0].rows[rows]], places, factor.y[rows])
+                off, _ = innovations_and_jacobians(factor.view, poses[blocks[0].rows[rows]], places, factor.y[rows])
                 z[i] = np.linalg.solve(np.linalg.cholesky(R), off.T).T
             error = z[np.arange(len(mine)), own].copy()
             z[np.arange(len(mine)), own] = np.nan

@@ -10,7 +10,7 @@ import numpy as np
 
 from kalmark.diagnosis.causes import TIMES, Finding
 from kalmark.diagnosis.error_columns import ALL
-from kalmark.diagnosis.jumps import LISTED, OddControl, size_of
+from kalmark.diagnosis.jumps import LISTED, OddControl, step_size
 from kalmark.results.figure_texts import figure
 from kalmark.slam.gaps import MARGIN
 
@@ -46,7 +46,7 @@ LIMITS = {
 }
 
 
-def words(finding: Finding, config: Mapping[str, Any]) -> Words:
+def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
     """Return what was found, in a sentence, and the line that would cure it, "" if no key does.
 
     `config` is the configuration of the run: a new noise is given as a number where it states the old one.
@@ -106,7 +106,7 @@ def _set(robot: str, path: str, value: float) -> str:
     return f"--set robots.{robot}.{path}={figure(value)}"
 
 
-def corrected(config: Mapping[str, Any], option: str, path: tuple[str, ...], by: float) -> str:
+def log_correction_line(config: Mapping[str, Any], option: str, path: tuple[str, ...], by: float) -> str:
     """Return the line that adds to the times of a sensor (`shift_s`), or multiplies a column (`factors`), of a log."""
     now = (config.get("log") or {}).get(option)
     for name in path:
@@ -127,7 +127,7 @@ def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
         baseline_m = _current(config, robot, "sensors", sensor, "baseline_m")
         return evidence, _set(robot, f"sensors.{sensor}.baseline_m", baseline_m / by) if baseline_m else ""
     factor = by if column == INVERSE else 1.0 / by
-    return evidence, " ".join(corrected(config, "factors", of, factor) for of in _in_log(finding, config))
+    return evidence, " ".join(log_correction_line(config, "factors", of, factor) for of in _in_log(finding, config))
 
 
 def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -158,7 +158,7 @@ def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
     evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say ({_sure(finding)})"
     where = finding.of[:1] if finding.of[1] == ALL else finding.of[:2]
-    return evidence, corrected(config, "shift_s", where, finding.value)
+    return evidence, log_correction_line(config, "shift_s", where, finding.value)
 
 
 def _mount_position(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -244,7 +244,7 @@ def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _jump(finding: Finding) -> str:
     """Return how far a jump goes, and how sure that is."""
-    far_m, turn_deg = size_of(np.zeros(3) if finding.at is None else finding.at)
+    far_m, turn_deg = step_size(np.zeros(3) if finding.at is None else finding.at)
     return f"{figure(far_m)} m and {figure(turn_deg)} deg ({figure(finding.value, 2)} sigma)"
 
 
@@ -265,7 +265,7 @@ def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
     return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding)}", ""
 
 
-def of_odd_control(finding: Finding, odd: OddControl) -> Words:
+def odd_control_text(finding: Finding, odd: OddControl) -> Words:
     """Return what a control says that jumps itself, and the limit that leaves it out, where its column has one."""
     robot = finding.of[0]
     degrees = odd.column.endswith(("_rad", "_radps"))

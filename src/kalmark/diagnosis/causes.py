@@ -115,7 +115,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
     return found
 
 
-def together(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
+def joint_errors(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
     """Return the systematic errors s (K,), all estimated at once, and their information (K, K); scales are small."""
     Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
     have, left = linear.residuals, linear.left(Z, W)
@@ -264,7 +264,7 @@ def outliers(linear: Linear, t_s: Array, r: Array | None = None) -> list[Finding
                     since_s=float(when.min(initial=np.inf)))]  # fmt: skip
 
 
-def landmarks(linear: Linear, t_s: Array) -> list[Finding]:
+def moving_landmarks(linear: Linear, t_s: Array) -> list[Finding]:
     """Return the landmarks that move: whose sightings fit a constant velocity better than a place.
 
     `t_s` (n,) are the times of the poses.  Only those are looked at that seem to move most with all else as it is.

@@ -19,7 +19,7 @@ import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import BatchState
-from kalmark.batch.data import BatchInput, replayed
+from kalmark.batch.data import BatchInput, replay_events
 from kalmark.batch.problem import Motions, Problem
 from kalmark.diagnosis.causes import BLOCKS
 from kalmark.diagnosis.linear import Left, Linear
@@ -111,7 +111,7 @@ class Components:
         self.parts = [part for part, some in zip(parts, acts, strict=True) if some]
 
     def _problem(self, values: Mapping[Noise, float]) -> Problem:
-        return replayed(replace(self.given, robots=with_noise(self.given.robots, values)), self.log)
+        return replay_events(replace(self.given, robots=with_noise(self.given.robots, values)), self.log)
 
     def linear(self, t: Array) -> Linear:
         """Return the problem with the variances exp(t) (K,) times those of the scales."""

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kalmark.cli.shared import RunFolder, Trust, computing, print_table, say
+from kalmark.cli.shared import RunFolder, Trust, limit_blas_threads, print_table, say
 
 
 def diagnose(
@@ -27,7 +27,7 @@ def diagnose(
     from kalmark.results.run import Run
     from kalmark.results.verdict_text import verdict_lines
 
-    with computing():
+    with limit_blas_threads():
         loaded = Run.load(run, trust)
         verdict = diagnosed(loaded, observations, progress=True)
         write(run / "summary.json", json.dumps(loaded.summary, indent=2, allow_nan=False) + "\n")

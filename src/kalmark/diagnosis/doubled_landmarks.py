@@ -49,7 +49,7 @@ class Pair(NamedTuple):
     score: float
 
 
-def split(run: Run) -> list[Pair]:
+def find_split_landmarks(run: Run) -> list[Pair]:
     """Return pairs of near landmarks that are one thing.
 
     They are sighted in turn, within a few scans, but never together.  Of two things, each is seen in a share p of the
@@ -82,7 +82,7 @@ class Revisits(NamedTuple):
     score: float
 
 
-def unseen(run: Run) -> Revisits | None:
+def unseen_counts(run: Run) -> Revisits | None:
     """Return how often landmarks were not seen where they were seen before; None if that is seldom, or by chance.
 
     A thing that stands is seen again from where it was seen, within a share `SAME` of its distance: nothing new hides
@@ -130,7 +130,7 @@ def _view(poses: Array, places: Array) -> tuple[Array, Array]:
     return np.linalg.norm(v, axis=1), np.asarray(wrap(np.arctan2(v[:, 1], v[:, 0]) - poses[:, 2]))
 
 
-def spacing(run: Run) -> float:
+def landmark_spacing(run: Run) -> float:
     """Return the median distance of a landmark to the next one, m."""
     places = np.array([*_places(run).values()])
     return float(np.median(cKDTree(places).query(places, k=[2])[0])) if len(places) > 1 else 0.0
@@ -170,7 +170,7 @@ def _in_turn(a: Ints, b: Ints) -> int:
     return 0 if (gaps == 0).any() else int((changes & (gaps <= NEAR_SCANS)).sum())
 
 
-def vanished(run: Run) -> list[Moment]:
+def vanished_landmarks(run: Run) -> list[Moment]:
     """Return when of the landmarks that a robot saw until then none is seen any more, which no ids say.
 
     Those of the last scans are compared with those of the next ones.  Of such landmarks a share p is seen again, so by

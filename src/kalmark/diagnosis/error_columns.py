@@ -47,7 +47,7 @@ def columns_of(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: 
     return [column for column in found if np.isfinite(column.Z).all() and (column.Z.any() or column.W.any())]
 
 
-def of_all_sensors(columns: list[Column]) -> list[Column]:
+def errors_of_all_sensors(columns: list[Column]) -> list[Column]:
     """Return the errors that all sensors of a robot may share, where it has several: one laser, one clock."""
     found: dict[tuple[str, str], list[Column]] = {}
     for column in (c for c in columns if c.name in SHARED):

@@ -19,9 +19,9 @@ from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
 from kalmark.diagnosis.cause_texts import UNKNOWN_IDS
-from kalmark.diagnosis.mistakes import Mistake, mistakes, section_of, shifted, with_value
+from kalmark.diagnosis.mistakes import Mistake, late_scans, mistakes, robot_section, with_value
 from kalmark.errors import KalmarkError
-from kalmark.events import Control, Event, Fix, Scan, order
+from kalmark.events import Control, Event, Fix, Scan, sort_key
 from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
 from kalmark.logs.progress import track
@@ -32,7 +32,7 @@ from kalmark.results.history import RobotStart
 from kalmark.results.measures import Rigid, level, level_sigmas, rigid, rigid_robust, rmse
 from kalmark.results.record import record
 from kalmark.results.run import Run
-from kalmark.results.warnings import budgeted
+from kalmark.results.warnings import left_out_by_attention
 from kalmark.slam.held_readings import AGAIN
 
 SCANS, OBSERVATIONS, EVENTS = 400, 3000, 10_000  # of the log are filtered again, whatever comes first
@@ -92,7 +92,7 @@ class Fit(NamedTuple):
 REFUSED = Fit(np.zeros(0), np.zeros(0))
 
 
-def fit(run: Run) -> Fit:
+def fit_of_run(run: Run) -> Fit:
     """Return how the observations of a run fit: what fits nothing counts `MOST`.
 
     What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
@@ -105,13 +105,13 @@ def fit(run: Run) -> Fit:
     d2 = np.minimum(np.nan_to_num(history.d2, nan=0.0) / dof, MOST)
     d2 = np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2)
     d2 = np.where((history.id == "") & (history.outcome != "associated"), LOST, d2)
-    early = (np.char.find(history.reason, ALONE) >= 0) | budgeted(history)
+    early = (np.char.find(history.reason, ALONE) >= 0) | left_out_by_attention(history)
     early |= (history.outcome == "deferred") & while_lost(history)[history.step]
     early |= history.reason == AGAIN
     return Fit(np.where(early, 1.0, d2), dof)
 
 
-def explained(before: Fit, after: Fit) -> float:
+def explained_chi2(before: Fit, after: Fit) -> float:
     """Return half of the chi-square that is less after than before; what a filter refused fitted nothing."""
     refused = MOST * float(after.dof.sum())
     return 0.5 * ((before.chi2 if len(before.values) else refused) - after.chi2)
@@ -121,37 +121,37 @@ def gross(run: Run, log: Log, progress: bool = False) -> Mistake | None:
     """Return the mistake that explains why a run does not fit, None if it does fit or if none explains it."""
     if not run.config.get("robots"):
         return None
-    found = elsewhere_from_the_start(run, log)
+    found = find_wrong_starts(run, log)
     if found is not None:
         return found
-    now = fit(run)
+    now = fit_of_run(run)
     first = misfits_from(now)
     if now.mean < MISFIT and not run.stopped:
-        found = exchanged(run, log, now)
+        found = find_exchanged_ids(run, log, now)
     else:
-        found = likeliest(run, log, beginning(run, log), run.config, progress) or exchanged(run, log, now)
-        found = found or (None if first is None else kidnapped(run, log, now, first))
-    return found or (None if first is None else later(run, log, first))
+        found = likeliest(run, log, first_events(run, log), run.config, progress) or find_exchanged_ids(run, log, now)
+        found = found or (None if first is None else find_kidnap(run, log, now, first))
+    return found or (None if first is None else find_later_mistake(run, log, first))
 
 
 def likeliest(
     run: Run, log: Log, events: list[Event], config: Mapping[str, Any], progress: bool = False
 ) -> Mistake | None:
     """Return the mistake without which events fit best, None if they fit as they are or without none."""
-    as_it_is = fit_of(config, log, events)
+    as_it_is = fit_of_events(config, log, events)
     if as_it_is.mean < MISFIT:
         return None
-    few, made = beginning(run, events, FEW_SCANS), []
-    few_as_they_are = fit_of(config, log, few)
+    few, made = first_events(run, events, FEW_SCANS), []
+    few_as_they_are = fit_of_events(config, log, few)
     for mistake in track([*mistakes(config, run)], "mistakes, one after the other", show=progress):
         if not fit_without(mistake, log, few).fits(MISFIT, few_as_they_are):
             continue
         after = fit_without(mistake, log, events)
-        if better(after, as_it_is):
-            gain = explained(as_it_is, after) - as_it_is.share * shrinkage(mistake, events)
+        if fits_better(after, as_it_is):
+            gain = explained_chi2(as_it_is, after) - as_it_is.share * shrinkage(mistake, events)
             made += [mistake._replace(gain=gain, since_s=events[0].t_s)] if gain > 0.0 else []
     if not made and (run.history.id == "").any():
-        made = [found for name in run.history.robots if (found := late(run, log, events, config, name, as_it_is))]
+        made = [found for name in run.history.robots if (found := find_delay(run, log, events, config, name, as_it_is))]
     if not made:
         return None
     most = max(mistake.gain for mistake in made)
@@ -161,12 +161,12 @@ def likeliest(
     return first._replace(evidence=f"{first.evidence}{told}")
 
 
-def better(after: Fit, before: Fit) -> bool:
+def fits_better(after: Fit, before: Fit) -> bool:
     """Whether a log fits without a mistake, and far better than with it."""
     return after.fits(FITS, before) and BETTER * after.mean < before.mean
 
 
-def late(
+def find_delay(
     run: Run, log: Log, events: list[Event], config: Mapping[str, Any], robot: str, as_it_is: Fit
 ) -> Mistake | None:
     """Return that the scans of a robot are late or early, if the events fit then.
@@ -186,7 +186,7 @@ def late(
         some = [round(best + k * step_s, 6) for k in (0, -1, 1)]
         for by_s in some:
             if by_s not in tried:
-                tried[by_s] = fit_without(shifted(config, robot, by_s), log, events)
+                tried[by_s] = fit_without(late_scans(config, robot, by_s), log, events)
         return min(some, key=lambda by_s: tried[by_s].mean)
 
     best, step, least = 0.0, max(control_s, 0.5 * scan_s), control_s
@@ -200,10 +200,10 @@ def late(
     while best != 0.0 and step > 1.5 * least:
         step *= 0.5
         best = near(step)
-    if not better(tried[best], as_it_is):
+    if not fits_better(tried[best], as_it_is):
         return None
-    gain = explained(as_it_is, tried[best])
-    return shifted(config, robot, best)._replace(gain=gain, since_s=events[0].t_s, share=0.0)
+    gain = explained_chi2(as_it_is, tried[best])
+    return late_scans(config, robot, best)._replace(gain=gain, since_s=events[0].t_s, share=0.0)
 
 
 def shrinkage(mistake: Mistake, events: list[Event]) -> float:
@@ -215,7 +215,7 @@ def shrinkage(mistake: Mistake, events: list[Event]) -> float:
     return sum(len(e.y) * mistake.shrunk.get((e.robot, e.sensor), 0.0) for e in events if isinstance(e, Scan))
 
 
-def later(run: Run, log: Log, first: int) -> Mistake | None:
+def find_later_mistake(run: Run, log: Log, first: int) -> Mistake | None:
     """Return the mistake from the observation `first` on: a sensor that was turned, a source that was exchanged.
 
     The log is filtered anew from there, from where the robots are.
@@ -226,7 +226,7 @@ def later(run: Run, log: Log, first: int) -> Mistake | None:
         before = np.flatnonzero((run.history.robot == robot) & (run.history.t_ns < t_ns))
         if len(before):
             x, y, theta = run.history.poses[before[-1]].tolist()
-            path = ("robots", section_of(config, robot))
+            path = ("robots", robot_section(config, robot))
             section = {**config["robots"][path[1]], "start": {"x_m": x, "y_m": y, "theta_rad": theta}}
             config = with_value(config, ("robots", robot), section)
     found = likeliest(run, log, rest, config)
@@ -248,12 +248,12 @@ def misfits_from(now: Fit) -> int | None:
     return first if values[first:].mean() > MISFIT else None
 
 
-def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
+def find_wrong_starts(run: Run, log: Log) -> Mistake | None:
     """Return that robots start elsewhere, or turned, if most of their fixes were rejected and then fit.
 
     The path of each robot without fixes and the others, moved about the vertical axis onto its fixes, says from where.
     """
-    events, config, told, begin_s = beginning(run, log), run.config, [], math.inf
+    events, config, told, begin_s = first_events(run, log), run.config, [], math.inf
     lost = [start for start in run.history.starts if _used(run, start.robot) <= 1.0 - REJECTED]
     for start in lost:
         found = _onto_its_fixes(run, log, events, start)
@@ -261,10 +261,10 @@ def elsewhere_from_the_start(run: Run, log: Log) -> Mistake | None:
             config, *words = started_at(config, start, *found)
             told.append(words)
             begin_s = min(begin_s, start.t_ns * 1e-9)
-    after = filtered(config, log, events) if told else None
-    if after is None or fit(after).mean > FITS or any(_used(after, start.robot) <= REJECTED for start in lost):
+    after = filter_events(config, log, events) if told else None
+    if after is None or fit_of_run(after).mean > FITS or any(_used(after, start.robot) <= REJECTED for start in lost):
         return None
-    gain = explained(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
+    gain = explained_chi2(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
     evidence, cure = (sep.join(parts) for sep, parts in zip(("; ", " "), zip(*told, strict=True), strict=True))
     return Mistake("start", evidence, cure, config, None, gain, begin_s)
 
@@ -274,7 +274,7 @@ def _onto_its_fixes(run: Run, log: Log, events: list[Event], start: RobotStart) 
 
     None if the path fits them nearly as well as it is: then it was another robot that started elsewhere.
     """
-    path = filtered(run.config, log, list(_alone(events, start.robot, run.history.robots)))
+    path = filter_events(run.config, log, list(_alone(events, start.robot, run.history.robots)))
     mine = np.zeros(0, np.bool_) if path is None else path.history.robot == start.robot
     if path is None or not mine.any():
         return None
@@ -357,18 +357,18 @@ def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:
     return Fit(np.minimum(d2, MOST), np.array([len(f.z) for f in fixes]))
 
 
-def kidnapped(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
+def find_kidnap(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
     """Return that the robot was moved, if the run does not fit from the observation `first` on, and a new one would.
 
     Or that landmarks were, if the log before and after it fits together without these.
     """
     t_ns, robot, rest = _from(run, log, first)
-    again, before = filtered(run.config, log, rest), now.of(slice(first, None))
-    after = REFUSED if again is None else fit(again)
+    again, before = filter_events(run.config, log, rest), now.of(slice(first, None))
+    after = REFUSED if again is None else fit_of_run(again)
     if again is None or after.mean > FITS or MUCH * after.mean > before.mean:
         return None
-    gain = explained(before.of(slice(len(after.values))), after)
-    found = moved(run, log, first, again)
+    gain = explained_chi2(before.of(slice(len(after.values))), after)
+    found = find_moved_landmarks(run, log, first, again)
     if found:
         return found._replace(gain=gain)
     evidence = (
@@ -377,17 +377,17 @@ def kidnapped(run: Run, log: Log, now: Fit, first: int) -> Mistake | None:
     return Mistake("kidnapped", evidence, "", run.config, None, gain, t_ns * 1e-9)
 
 
-def moved(run: Run, log: Log, first: int, again: Run) -> Mistake | None:
+def find_moved_landmarks(run: Run, log: Log, first: int, again: Run) -> Mistake | None:
     """Return that landmarks were moved, if most are where they were in a run `again` from an observation on.
 
     Where a robot is moved all of them are, and the log before and after it does not fit together without a few.
     """
     t_ns, _, rest = _from(run, log, first)
     old, new = run.history.map_at(int(run.history.step[first - WINDOW]) - 1), again.landmarks
-    both = aligned(_places(old.ids, old.means[:, : run.history.d]), _places(new.ids, new.positions()[0]))
+    both = align_maps(_places(old.ids, old.means[:, : run.history.d]), _places(new.ids, new.positions()[0]))
     names = [] if both is None else [str(both.names[k]) for k in np.flatnonzero(~both.still)]
     around = [_without(e, {*names}) for e in log.events if abs(e.t_ns - t_ns) <= rest[-1].t_ns - t_ns]
-    if not names or fit_of(run.config, log, around).mean > FITS:
+    if not names or fit_of_events(run.config, log, around).mean > FITS:
         return None
     told = ", ".join(names)
     what = f"landmark {told} was" if len(names) == 1 else f"landmarks {told} were"
@@ -409,7 +409,7 @@ def _rows_of(e: Scan, rows: list[int]) -> Scan:
     return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y[rows], ids=ids, cov=cov)
 
 
-def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
+def find_exchanged_ids(run: Run, log: Log, now: Fit) -> Mistake | None:
     """Return that ids mean other landmarks from some time on: those whose sightings do not fit any more.
 
     The log is filtered anew from there.  Most landmarks are where they were, after a rigid alignment, but some where
@@ -419,16 +419,16 @@ def exchanged(run: Run, log: Log, now: Fit) -> Mistake | None:
     if first is None:
         return None
     t_ns, _, rest = _from(run, log, first)
-    after = filtered(run.config, log, rest)
-    if after is None or fit(after).mean > FITS:
+    after = filter_events(run.config, log, rest)
+    if after is None or fit_of_run(after).mean > FITS:
         return None
     old = run.history.map_at(int(run.history.step[first]) - 1)
     new = after.landmarks
-    others = elsewhere(_places(old.ids, old.means[:, : run.history.d]), _places(new.ids, new.positions()[0]))
+    others = displaced_landmarks(_places(old.ids, old.means[:, : run.history.d]), _places(new.ids, new.positions()[0]))
     if not others:
         return None
     ids = "; ".join(f"what is called {a} is where {b} was" for a, b in others.items())
-    gain = explained(now.of(slice(first, first + len(after.history.d2))), fit(after))
+    gain = explained_chi2(now.of(slice(first, first + len(after.history.d2))), fit_of_run(after))
     evidence = f"ids mean other landmarks from t={t_ns * 1e-9:.1f} s on: {ids}"
     return Mistake("wrong_ids", evidence, UNKNOWN_IDS, run.config, None, gain, t_ns * 1e-9, len(others) / len(old.ids))
 
@@ -458,7 +458,7 @@ class Aligned(NamedTuple):
     near: float
 
 
-def aligned(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> Aligned | None:
+def align_maps(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> Aligned | None:
     """Return the landmarks of two maps, None if they are few or if most are elsewhere."""
     common = [name for name in after if name in before]
     if len(common) < COMMON:
@@ -473,9 +473,9 @@ def aligned(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> Aligned 
     return Aligned(common, rigid(new[still], old[still])(new), still, near)
 
 
-def elsewhere(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> dict[Any, Any]:
+def displaced_landmarks(before: Mapping[Any, Array], after: Mapping[Any, Array]) -> dict[Any, Any]:
     """Return the landmarks that are now where another one was, and which: after the alignment of most of all."""
-    both = aligned(before, after)
+    both = align_maps(before, after)
     if both is None:
         return {}
     names = list(before)
@@ -493,10 +493,10 @@ def _from(run: Run, log: Log, row: int) -> tuple[int, str, list[Event]]:
     """Return the time and robot of an observation, and the events of the log from there."""
     step = int(run.history.step[row])
     t_ns = int(run.history.t_ns[step])
-    return t_ns, str(run.history.robot[step]), beginning(run, [e for e in log.events if e.t_ns >= t_ns])
+    return t_ns, str(run.history.robot[step]), first_events(run, [e for e in log.events if e.t_ns >= t_ns])
 
 
-def beginning(run: Run, events: Log | list[Event], most: int = SCANS) -> list[Event]:
+def first_events(run: Run, events: Log | list[Event], most: int = SCANS) -> list[Event]:
     """Return the first events, with so many scans and observations; in a raw scan are few, however many its beams."""
     robots = run.final_slam().robots.values()
     detected = {(r.name, name) for r in robots for name, m in r.sensors.items() if m.detector is not None}
@@ -512,16 +512,18 @@ def beginning(run: Run, events: Log | list[Event], most: int = SCANS) -> list[Ev
 
 def fit_without(mistake: Mistake, log: Log, events: list[Event]) -> Fit:
     """Return how events fit without a mistake."""
-    return fit_of(mistake.config, log, sorted(map(mistake.change, events), key=order) if mistake.change else events)
+    return fit_of_events(
+        mistake.config, log, sorted(map(mistake.change, events), key=sort_key) if mistake.change else events
+    )
 
 
-def fit_of(config: Mapping[str, Any], log: Log, events: list[Event]) -> Fit:
+def fit_of_events(config: Mapping[str, Any], log: Log, events: list[Event]) -> Fit:
     """Return how events fit under a configuration."""
-    run = filtered(config, log, events)
-    return REFUSED if run is None else fit(run)
+    run = filter_events(config, log, events)
+    return REFUSED if run is None else fit_of_run(run)
 
 
-def filtered(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
+def filter_events(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
     """Return the run of events under a configuration, None if they are refused."""
     try:
         made = config_of(Tree(deepcopy(dict(config))), None)

@@ -61,7 +61,7 @@ class Controls:
         return OddControl(float(self.t_s[k]), self.columns[column], value, float(times[row, column]), most)
 
 
-def joined(found: Sequence[Finding], begin_s: float) -> list[Finding]:
+def merge_jumps(found: Sequence[Finding], begin_s: float) -> list[Finding]:
     """Return findings with the jumps of each robot as one: the largest, and the times of all in s of the log.
 
     The first scan is at `begin_s`.
@@ -76,7 +76,7 @@ def joined(found: Sequence[Finding], begin_s: float) -> list[Finding]:
     return rest
 
 
-def size_of(step: Array) -> tuple[float, float]:
+def step_size(step: Array) -> tuple[float, float]:
     """Return how far a step (3,) or (6,) goes, m, and turns, deg."""
     d = 2 if len(step) == 3 else 3
     return float(np.linalg.norm(step[:d])), math.degrees(float(np.linalg.norm(step[d:])))

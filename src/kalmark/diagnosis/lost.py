@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Flags
-from kalmark.diagnosis.gross_mistakes import FITS, MUCH, WINDOW, fit
+from kalmark.diagnosis.gross_mistakes import FITS, MUCH, WINDOW, fit_of_run
 from kalmark.results.checked import DOUBTFUL, UNCHECKED, Sign
 from kalmark.results.control_gaps import KNOWN
 from kalmark.results.figure_texts import figure
@@ -27,7 +27,7 @@ class Lost(NamedTuple):
     of: str
 
 
-def lost(run: Run) -> Iterator[Lost]:
+def find_lost_robots(run: Run) -> Iterator[Lost]:
     """Yield the robots whose positions were all left out for the last half minute or more, without a landmark in it."""
     h = run.history
     t_ns = h.t_ns[h.step]
@@ -55,12 +55,12 @@ def _positions(run: Run, name: str) -> Flags:
     return np.asarray((h.robot[h.step] == name) & h.of_own & np.isin(h.sensor, placing))
 
 
-def ends(run: Run) -> Iterator[tuple[str, Sign]]:
+def unchecked_ends(run: Run) -> Iterator[tuple[str, Sign]]:
     """Yield the robots of which the log does not check where they are at its end, and why.
 
     Dead reckoning does not matter while the position stays known to what it was, to a factor of `KNOWN`.
     """
-    h, now, slam = run.history, fit(run).values, run.final_slam()
+    h, now, slam = run.history, fit_of_run(run).values, run.final_slam()
     for name in h.robots:
         steps = np.flatnonzero(h.robot == name)
         times = h.t_ns[steps].tolist()

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.diagnosis.cause_texts import corrected
+from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.events import Control, Event, Scan
-from kalmark.logs.log_corrections import at_time
+from kalmark.logs.log_corrections import event_at_time
 from kalmark.results.figure_texts import figure
 from kalmark.results.run import Run
 from kalmark.slam.robot import Robot
@@ -70,7 +70,7 @@ def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
         yield from _of_controls(config, robot)
     if any(column.endswith("ps") for robot in robots.values() for column in robot.motion.columns):
         for unit, factor in TIMES.items():
-            cure = corrected(config, "factors", ("t_s",), factor)
+            cure = log_correction_line(config, "factors", ("t_s",), factor)
             yield Mistake("units", f"times fit only if they are {unit}", cure, config, _at(factor))
 
 
@@ -94,10 +94,14 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
     lengths = [name for name in names if name in ("range_m", "x_m", "y_m", "z_m", "distance_m", "right_m", "left_m")]
 
     def made(name: str, evidence: str, which: list[str], factor: float) -> Mistake:
-        cures = (corrected(config, "factors", (*where, column), factor) for where in sensors for column in which)
+        cures = (
+            log_correction_line(config, "factors", (*where, column), factor) for where in sensors for column in which
+        )
         by = np.array([factor if column in which else 1.0 for column in names])
         shrunk = dict.fromkeys(sensors, -math.log(float(np.abs(by).prod())))
-        return Mistake(name, evidence, " ".join(cures), config, measured({*sensors}, lambda y: y * by), shrunk=shrunk)
+        return Mistake(
+            name, evidence, " ".join(cures), config, change_measurements({*sensors}, lambda y: y * by), shrunk=shrunk
+        )
 
     if turned or names[:2] == ("x_m", "y_m"):
         evidence = f"directions of {of} fit only with their sign changed: clockwise, or upside down"
@@ -107,21 +111,21 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
     if names == ("range_m", "bearing_rad"):
         evidence = f"range and bearing of {of} are swapped"
         cure = "swap the columns range_m and bearing_rad"
-        yield Mistake("swapped_columns", evidence, cure, config, measured({*sensors}, lambda y: y[:, ::-1]))
+        yield Mistake("swapped_columns", evidence, cure, config, change_measurements({*sensors}, lambda y: y[:, ::-1]))
     for unit, factor in LENGTHS.items() if lengths else ():
         yield made("units", f"distances of {of} fit only if they are {unit}", lengths, factor)
 
 
 def _of_mounts(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
     """Yield other directions in which the sensors of a robot may look; those with one mount look there together."""
-    space, at = robot.motion.space.axes > 1, ("robots", section_of(config, robot.name), "sensors")
+    space, at = robot.motion.space.axes > 1, ("robots", robot_section(config, robot.name), "sensors")
     places: dict[bytes, list[str]] = {}
     for sensor, mount in robot.sensors.items():
         names = tuple(mount.sensor.columns)
         camera = any(name.endswith("_px") for name in names)
         looks = mount.detector is not None or names[:2] == ("x_m", "y_m")
         if camera:
-            now = stated(config, (*at, sensor, "mount")) or {}
+            now = configured_value(config, (*at, sensor, "mount")) or {}
             if space and not any(now.get(name) for name in ("roll_deg", "pitch_deg", "yaw_deg")):
                 key = f"robots.{robot.name}.sensors.{sensor}.mount"
                 evidence = f"{robot.name}.{sensor} fits only with its optical axis forward: its mount lacks that turn"
@@ -140,8 +144,8 @@ def _turned(config: Mapping[str, Any], robot: str, sensors: list[str], turn: int
     name, cures = "yaw_deg" if space else "theta_rad", []
     of = f"the sensor {robot}.{sensors[0]} looks" if len(sensors) == 1 else f"{' and '.join(sensors)} of {robot} look"
     for sensor in sensors:
-        path = ("robots", section_of(config, robot), "sensors", sensor, "mount", name)
-        old = float(stated(config, path) or 0.0)
+        path = ("robots", robot_section(config, robot), "sensors", sensor, "mount", name)
+        old = float(configured_value(config, path) or 0.0)
         angle = math.remainder(old + turn, 360.0) if space else math.remainder(old + turn * DEGREE, 2 * math.pi)
         config = with_value(config, path, angle)
         cures.append(f"--set robots.{robot}.sensors.{sensor}.mount.{name}={angle:.4f}")
@@ -154,7 +158,7 @@ def _of_controls(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
     names, of = tuple(robot.motion.columns), robot.name
 
     def made(name: str, evidence: str, which: list[str], factor: float) -> Mistake:
-        cure = " ".join(corrected(config, "factors", (of, column), factor) for column in which)
+        cure = " ".join(log_correction_line(config, "factors", (of, column), factor) for column in which)
         by = np.array([factor if column in which else 1.0 for column in names])
         return Mistake(name, evidence, cure, config, _controlled(of, lambda u: u * by))
 
@@ -175,24 +179,24 @@ def _of_controls(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
         yield made("units", f"speeds of the controls of {of} fit only if they are {unit}", speeds, factor)
 
 
-def shifted(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
+def late_scans(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
     """Return that the scans of a robot were made so much later than their stamps say."""
     evidence = f"scans of {robot} were made {figure(abs(by_s))} s {'later' if by_s > 0 else 'earlier'} than stamped"
-    cure = corrected(config, "shift_s", (robot,), by_s)
+    cure = log_correction_line(config, "shift_s", (robot,), by_s)
     by_ns = round(by_s * 1e9)
     return Mistake(
         LATE, evidence, cure, config,
-        lambda e: at_time(e, e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e,
+        lambda e: event_at_time(e, e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e,
     )  # fmt: skip
 
 
 # ------------------------------------------------------------------ configurations and events without them
-def section_of(config: Mapping[str, Any], robot: str) -> str:
+def robot_section(config: Mapping[str, Any], robot: str) -> str:
     """Return the name of the section of a robot."""
     return robot if robot in config["robots"] else "each"
 
 
-def stated(config: Mapping[str, Any], path: tuple[str, ...]) -> Any:
+def configured_value(config: Mapping[str, Any], path: tuple[str, ...]) -> Any:
     """Return what a configuration has at a path, None for nothing."""
     section: Any = config
     for key in path:
@@ -214,12 +218,12 @@ def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> 
     return changed
 
 
-def measured(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
+def change_measurements(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
     """Return what changes the measurements y (K, m) of some sensors."""
 
     def changed(e: Event) -> Event:
         if isinstance(e, Scan) and len(e.y) and (e.robot, e.sensor) in sensors:
-            return at_time(e, e.t_ns, change(e.y))
+            return event_at_time(e, e.t_ns, change(e.y))
         return e
 
     return changed
@@ -230,4 +234,4 @@ def _controlled(robot: str, change: Callable[[Array], Array]) -> Change:
 
 
 def _at(factor: float) -> Change:
-    return lambda e: at_time(e, round(e.t_ns * factor))
+    return lambda e: event_at_time(e, round(e.t_ns * factor))

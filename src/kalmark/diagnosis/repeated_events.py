@@ -34,7 +34,7 @@ class Copies(NamedTuple):
     noticed: bool = False
 
 
-def copied(values: Array, first: Index) -> Flags:
+def repeated_measurements(values: Array, first: Index) -> Flags:
     """Return which (S,) of successive measurements are copies of the one before; none, if they are few.
 
     `values` (K, m) are the rows of all measurements, `first` (S,) is the first row of each.
@@ -52,14 +52,14 @@ def copied(values: Array, first: Index) -> Flags:
     return same if enough else np.zeros_like(same)
 
 
-def of_scans(run: Run) -> Flags:
+def repeated_scans(run: Run) -> Flags:
     """Return which observations (O,) of a run are in a scan that is a copy of the one before."""
     h, out = run.history, np.zeros(len(run.history.step), dtype=np.bool_)
     robot = h.robot[h.step]
     for key in sorted({*zip(robot.tolist(), h.sensor.tolist(), strict=True)}):
         rows = np.flatnonzero((robot == key[0]) & (h.sensor == key[1]))
         _, first, count = np.unique(h.step[rows], return_index=True, return_counts=True)
-        out[rows] = np.repeat(copied(h.y[rows], first), count)
+        out[rows] = np.repeat(repeated_measurements(h.y[rows], first), count)
     return out
 
 
@@ -68,7 +68,7 @@ def copies(run: Run, log: Log) -> list[Copies]:
     h, slam = run.history, run.final_slam()
     given = {key: one for key, one in slam.state.given.items() if one.repeats >= max(LEAST, SHARE * one.number)}
     found = [Copies(*key, one.repeats, one.number, one.since_ns * 1e-9, True) for key, one in given.items()]
-    same, robot = of_scans(run), run.history.robot[run.history.step]
+    same, robot = repeated_scans(run), run.history.robot[run.history.step]
     for key in sorted({*zip(robot[same].tolist(), h.sensor[same].tolist(), strict=True)}):
         if key in given:
             continue
@@ -78,7 +78,7 @@ def copies(run: Run, log: Log) -> list[Copies]:
         found.append(Copies(*key, len(steps), len(np.unique(h.step[mine])), since_s))
     for name in slam.robots:
         mine_ = [e for e in log.events if isinstance(e, Control) and e.robot == name and e.share == 1.0]
-        twice = np.flatnonzero(copied(np.array([e.u for e in mine_]), np.arange(len(mine_))))
+        twice = np.flatnonzero(repeated_measurements(np.array([e.u for e in mine_]), np.arange(len(mine_))))
         if len(twice):
             found.append(Copies(name, "", len(twice), len(mine_), mine_[twice[0]].t_s))
     return found

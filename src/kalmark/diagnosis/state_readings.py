@@ -16,9 +16,9 @@ from scipy.special import chdtri
 
 from kalmark.arrays import Array
 from kalmark.diagnosis.cause_search import LEAST_GAIN
-from kalmark.diagnosis.cause_texts import corrected
-from kalmark.diagnosis.gross_mistakes import ALIKE, FITS, MISFIT, MOST, beginning, filtered
-from kalmark.diagnosis.mistakes import Mistake, Where, measured, section_of, stated, with_value
+from kalmark.diagnosis.cause_texts import log_correction_line
+from kalmark.diagnosis.gross_mistakes import ALIKE, FITS, MISFIT, MOST, filter_events, first_events
+from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, configured_value, robot_section, with_value
 from kalmark.events import Event
 from kalmark.geometry.gaussian import quantile
 from kalmark.logs.log import Log
@@ -85,11 +85,11 @@ class Filtered(NamedTuple):
 
 def filtered_with(config: Mapping[str, Any], log: Log, events: list[Event]) -> Filtered | None:
     """Return how events fit under a configuration, None if they are refused."""
-    run = filtered(config, log, events)
-    return None if run is None else judged(run)
+    run = filter_events(config, log, events)
+    return None if run is None else fit_of_readings(run)
 
 
-def judged(run: Run) -> Filtered:
+def fit_of_readings(run: Run) -> Filtered:
     """Return how the observations of a run fit."""
     h = run.history
     known = np.isfinite(h.z)
@@ -101,7 +101,7 @@ def judged(run: Run) -> Filtered:
     return Filtered(run, np.where(np.isfinite(logdet), d2, np.nan), logdet, dof)
 
 
-def gained(before: Filtered, after: Filtered, scaled: Where | None = None) -> float:
+def likelihood_gain(before: Filtered, after: Filtered, scaled: Where | None = None) -> float:
     """Return the logarithm of the likelihood ratio of two runs of the same events.
 
     Readings that are `scaled` do not count themselves: the filter takes the noise of a control for its own, so that
@@ -122,7 +122,7 @@ class _Sensor:
         run = as_it_is.run
         self.sensor: Any = run.final_slam().robots[of[0]].sensors[of[1]].sensor
         self.space = run.history.in_space
-        self.path = ("robots", section_of(config, of[0]), "sensors", of[1])
+        self.path = ("robots", robot_section(config, of[0]), "sensors", of[1])
         self.size = float(np.sqrt(np.nanmax(np.mean(run.history.z[as_it_is.of(of)] ** 2, axis=0))))
 
     def trials(self) -> Iterator[Mistake | None]:
@@ -145,19 +145,23 @@ class _Sensor:
         """Return a mistake with its gain, None where the log does not fit without it."""
         if by is not None:
             change = partial(np.multiply, by)
-        turned = None if change is None else measured({self.where}, change)
+        turned = None if change is None else change_measurements({self.where}, change)
         events = self.events if turned is None else [turned(e) for e in self.events]
         after = filtered_with(config, self.log, events)
         if after is None or after.mean(self.where) > FITS:
             return None
         scaled = by is not None and bool((np.abs(by) != 1.0).any())
-        gain = gained(self.as_it_is, after, self.where if scaled else None)
+        gain = likelihood_gain(self.as_it_is, after, self.where if scaled else None)
         return Mistake(name, *told(after), config, turned, gain) if gain > LEAST_GAIN else None
 
     # ------------------------------------------------------------------ each kind
     def noise(self) -> Mistake | None:
         """Return that it has more noise than stated: so many times that the innovations are as large as they say."""
-        keys = [k for k in dict.fromkeys(self.sensor.sigmas) if isinstance(stated(self.config, (*self.path, k)), float)]
+        keys = [
+            k
+            for k in dict.fromkeys(self.sensor.sigmas)
+            if isinstance(configured_value(self.config, (*self.path, k)), float)
+        ]
         now, times, config = self.as_it_is, 1.0, self.config
         for _ in range(ROUNDS):
             mine = now.of(self.where)
@@ -167,7 +171,7 @@ class _Sensor:
             times *= step
             config = self.config
             for k in keys:
-                config = with_value(config, (*self.path, k), stated(self.config, (*self.path, k)) * times)
+                config = with_value(config, (*self.path, k), configured_value(self.config, (*self.path, k)) * times)
             found = filtered_with(config, self.log, self.events)
             if found is None:
                 return None
@@ -175,24 +179,24 @@ class _Sensor:
             if abs(step - 1.0) < SAME:
                 break
         what = f"readings of {'.'.join(self.where)} fit if their noise is {figure(times, 2)} times as large as stated"
-        cure = " ".join(self.cured(k, stated(config, (*self.path, k))) for k in keys)
+        cure = " ".join(self.cured(k, configured_value(config, (*self.path, k))) for k in keys)
         return self.trial(SIGMA, config, lambda _: (what, cure)) if keys else None
 
     def constants(self) -> Iterator[Mistake | None]:
         """Yield that a constant of it is not as stated, or its mount: each as the filter finds it."""
         constants = [*self.sensor.constants]
-        if stated(self.config, (*self.path, SIGMA_SCALE)) is not None:
+        if configured_value(self.config, (*self.path, SIGMA_SCALE)) is not None:
             constants.append(("scale", SIGMA_SCALE, ""))
         for key in dict.fromkeys(key for _, key, _ in constants if key):
             names = [name for name, of, _ in constants if of == key]
             sigma = {"scale": MOST_SCALE, "declination_rad": math.pi}.get(names[0], WIDER * self.size)
-            if float(stated(self.config, (*self.path, key)) or 0.0) * WIDER < sigma:
+            if float(configured_value(self.config, (*self.path, key)) or 0.0) * WIDER < sigma:
                 yield self.in_map(SCALE if names == ["scale"] else CONSTANT, (key,), sigma, names)
         if self.sensor.views == POSE and self.sensor.columns[0] == "x_m":
             key = "sigma_position_m" if self.space else "sigma_xy_m"
             names = ["x_m", "y_m", "z_m"] if self.space else ["x_m", "y_m"]
             sigma = WIDER * self.size
-            if float(np.max(stated(self.config, (*self.path, "mount", key)) or 0.0)) * WIDER < sigma:
+            if float(np.max(configured_value(self.config, (*self.path, "mount", key)) or 0.0)) * WIDER < sigma:
                 yield self.in_map(ARM, ("mount", key), sigma, names)
 
     def in_map(
@@ -204,7 +208,7 @@ class _Sensor:
 
         def told(after: Filtered) -> tuple[str, str]:
             found = {m.name: mount_figures(m) for m in after.run.history.mounts}[".".join(self.where)]
-            old = [float(stated(self.config, (*self.path, *path, n)) or (n == "scale")) for n in names]
+            old = [float(configured_value(self.config, (*self.path, *path, n)) or (n == "scale")) for n in names]
             values = [
                 f"{n} {figure(found[n])} ± {figure(found[f'sigma_{n}'], 2)} instead of {figure(o)}"
                 for n, o in zip(names, old, strict=True)
@@ -221,7 +225,7 @@ class _Sensor:
         for names in dict.fromkeys([*((c,) for c in columns), columns]):
             by = np.array([-1.0 if c in names else 1.0 for c in columns])
             what = f"the sign of {', '.join(names)} changed"
-            cure = " ".join(corrected(self.config, "factors", (*self.where, c), -1.0) for c in names)
+            cure = " ".join(log_correction_line(self.config, "factors", (*self.where, c), -1.0) for c in names)
             if columns == ("heading_rad",):  # clockwise headings count from another direction, too
                 key = ("sigma_declination_rad",)
                 yield self.in_map(SIGN, key, math.pi, ["declination_rad"], by, (f"{what}, and ", cure))
@@ -240,7 +244,9 @@ class _Sensor:
 
         def tried(by: float) -> Mistake | None:
             what = f"readings of {'.'.join(self.where)} fit if they are multiplied by {figure(by)}"
-            cure = " ".join(corrected(self.config, "factors", (*self.where, c), by) for c in self.sensor.columns)
+            cure = " ".join(
+                log_correction_line(self.config, "factors", (*self.where, c), by) for c in self.sensor.columns
+            )
             factors = np.full(len(self.sensor.columns), by)
             return self.trial(SCALE, self.config, lambda _: (what, cure), factors)
 
@@ -267,7 +273,7 @@ def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], 
     """
     if not run.config.get("robots") or run.stopped:
         return [], None
-    config, events, found = dict(run.config), beginning(run, log, SCANS), list[Mistake]()
+    config, events, found = dict(run.config), first_events(run, log, SCANS), list[Mistake]()
     now = filtered_with(config, log, events)
     while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
         of = [_Sensor(now, config, log, events, where) for where in now.tried()]

@@ -19,13 +19,13 @@ from scipy.stats import chi2, norm
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import LANDMARKS, Ints
-from kalmark.batch.data import replayed
+from kalmark.batch.data import replay_events
 from kalmark.batch.solver import optimum
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.config.reading import config_of, resolve_config
 from kalmark.config.tree import Tree, read_tree
 from kalmark.diagnosis import causes
-from kalmark.diagnosis.batch_search import NEAR, calibrated, sensors_of
+from kalmark.diagnosis.batch_search import NEAR, apply_calibration, sensors_of
 from kalmark.diagnosis.calibrations import ALPHA, calibrations
 from kalmark.diagnosis.cause_search import LEAST_GAIN
 from kalmark.diagnosis.causes import Finding
@@ -35,7 +35,7 @@ from kalmark.diagnosis.tunable_keys import Keys, Path_, Values
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.logs.progress import track
-from kalmark.results.batch import given_by
+from kalmark.results.batch import batch_input
 from kalmark.results.measures import nis
 from kalmark.results.record import record
 from kalmark.results.run import Run
@@ -210,19 +210,21 @@ class _Task:
     # ------------------------------------------------------------------ estimates
     def fit(self, run: Run, values: Values, sure: set[Path_]) -> _Fit:
         """Return the estimates from a run over the first part, with these values."""
-        given = calibrated(run, given_by(run))
-        problem = replayed(given, self.first)
+        given = apply_calibration(run, batch_input(run))
+        problem = replay_events(given, self.first)
         if not problem.factors:
             raise KalmarkError("tune: no observation of the first part was of a landmark in the map")
         linear = Linear.of(problem, optimum(problem, tolerance=NEAR).state)
         found, alike = calibrations(run, linear, given, self.keys, sure)
         for finding in found:
             path, value = finding.of, finding.value
-            values[path] = _calibrated(path, self.keys.stated(path) if path not in values else values[path], value)
+            values[path] = _remove_systematic_error(
+                path, self.keys.stated(path) if path not in values else values[path], value
+            )
         again = self.run(values, self.first) if found else run
         if found:
-            given = calibrated(again, given_by(again))
-            problem = replayed(given, self.first)
+            given = apply_calibration(again, batch_input(again))
+            problem = replay_events(given, self.first)
             linear = Linear.of(problem, optimum(problem, tolerance=NEAR).state)
         components = Components(given, self.first, linear.state, self.keys.noises(run))
         now = {n: values.get(n.path, n.stated) for n in components.noises}
@@ -394,7 +396,7 @@ def values_of(noises: Mapping[Noise, Estimate]) -> dict[Noise, float]:
     return {noise: estimate.value for noise, estimate in noises.items()}
 
 
-def _calibrated(path: Path_, value: float, s: float) -> float:
+def _remove_systematic_error(path: Path_, value: float, s: float) -> float:
     """Return a calibration with the systematic error s taken out."""
     kind = path[-1]
     return value * (1.0 + s) if kind == "scale" else value + s if kind == "bias_m" else value - s

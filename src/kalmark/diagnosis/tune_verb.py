@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, computing, number, print_table, say, writable
+from kalmark.cli.shared import Overrides, figure_text, limit_blas_threads, print_table, say, writable
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
@@ -46,17 +46,17 @@ def tune(
     if out.suffix not in (".yaml", ".yml"):
         raise KalmarkError(f"--out {out}: expected a path that ends with .yaml")
     writable(out.parent)
-    with computing():
+    with limit_blas_threads():
         tuning = tuned(config, log, overrides or (), share=share, aim=aim.value, keep=keep or (), progress=True)
     text, picture = new_config(config, tuning, overrides or (), log), out.with_suffix(".png")
     out.parent.mkdir(parents=True, exist_ok=True)
     write(out, text)
     save_figure(draw_tuning(tuning, Path(config).stem), picture)
-    show(tuning)
+    print_tuning(tuning)
     say(f"{out}: the new configuration; {picture}: the NIS before and after")
 
 
-def show(tuning: Tuning) -> None:
+def print_tuning(tuning: Tuning) -> None:
     """Print what became of each key, and how both parts of the log fit before and after."""
     from kalmark.diagnosis.tuned_file import cells, correlation_lines
 
@@ -65,9 +65,9 @@ def show(tuning: Tuning) -> None:
     rows = []
     for label, k in (("the part it was tuned by", 0), ("the part that judges", 1)):
         one, two = tuning.before[k], tuning.after[k]
-        shares = (number(x.left_out, "%") for x in (one, two))
+        shares = (figure_text(x.left_out, "%") for x in (one, two))
         gain = f"{two.likelihood - one.likelihood:+.0f}"
-        rows.append((label, number(one.nis), number(two.nis), gain, *shares))
+        rows.append((label, figure_text(one.nis), figure_text(two.nis), gain, *shares))
     head = ("", "NIS per dof before", "after", "log-likelihood", "left out (%) before", "after")
     print_table("", head, rows, align="<>>>>>")
     for line in correlation_lines(tuning):

@@ -19,13 +19,13 @@ from kalmark.diagnosis.causes import LEAST_INFORMATION, SEEN, SHOWS, Finding, sy
 from kalmark.diagnosis.error_columns import Column
 from kalmark.diagnosis.linear import Linear
 from kalmark.geometry.rotations import matrix
-from kalmark.models.observe import MOUNT, composed
+from kalmark.models.observe import MOUNT, sensor_pose
 
 TURNED = "mount"  # the cause
 STRETCHES, ROUNDS = 20, 4  # in which the time is looked for, and how often within the best of them
 
 
-def turned(linear: Linear, t_s: Array) -> list[Finding]:
+def find_turned_mounts(linear: Linear, t_s: Array) -> list[Finding]:
     """Return of each sensor the turn of its mount, from some time on, that explains most.
 
     `t_s` (n,) are the times of the poses.  A turn that is smaller than the noise of a sighting is none: a calibration
@@ -65,7 +65,7 @@ def _axes(state: BatchState, factor: Factor) -> Iterator[Array]:
     """Yield how a robot would move (K, dof), about its sensor, to see what the sensor sees if that turns."""
     block, mount = factor.term.blocks[0], factor.view[MOUNT] if isinstance(factor.view, tuple) else factor.view.mount
     poses = state.groups[POSES][block.rows]
-    arm = poses[:, : state.d] - np.array([composed(pose, mount)[0][: state.d] for pose in poses])
+    arm = poses[:, : state.d] - np.array([sensor_pose(pose, mount)[0][: state.d] for pose in poses])
     if state.d == 2:
         yield np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(poses))])
         return

@@ -12,25 +12,25 @@ from scipy.special import pdtrc
 from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.batch_state import LANDMARKS
 from kalmark.diagnosis import doubled_landmarks, repeated_events
-from kalmark.diagnosis.batch_search import MORE, WORST, Searched, misfits, searched
+from kalmark.diagnosis.batch_search import MORE, WORST, Searched, misfits, search_causes
 from kalmark.diagnosis.blind import blind
 from kalmark.diagnosis.cause_search import LEAST_GAIN, Search
-from kalmark.diagnosis.cause_texts import of_odd_control, words
+from kalmark.diagnosis.cause_texts import finding_text, odd_control_text
 from kalmark.diagnosis.causes import JUMPS, Finding
-from kalmark.diagnosis.gross_mistakes import FITS, LOST, MOVED, fit, gross, started_at
+from kalmark.diagnosis.gross_mistakes import FITS, LOST, MOVED, fit_of_run, gross, started_at
 from kalmark.diagnosis.gross_mistakes import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.gross_mistakes import MOST as MOST_D2
-from kalmark.diagnosis.jumps import LISTED, Controls, joined
+from kalmark.diagnosis.jumps import LISTED, Controls, merge_jumps
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.lost import ends, lost
+from kalmark.diagnosis.lost import find_lost_robots, unchecked_ends
 from kalmark.diagnosis.mistakes import LATE, Mistake
-from kalmark.diagnosis.state_readings import SIGMA, judged, reasons
+from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
 from kalmark.diagnosis.turned_mounts import TURNED
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
-from kalmark.results.batch import filtered_map, of_the_filter_alone
-from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst
-from kalmark.results.control_gaps import RULED_OUT, left_out, matters, stayed_lost
+from kalmark.results.batch import filter_only_sensors, filtered_map
+from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst_status
+from kalmark.results.control_gaps import RULED_OUT, controls_left_out, is_reported, stayed_lost
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import RelocatedRobot
@@ -138,7 +138,7 @@ def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         return verdict
     of_it = (mistake.name, "kidnapped") if mistake.name in (LATE, MOVED) else ()
     rest = [c for c in verdict.causes if c.name not in of_it]
-    status = worst(
+    status = worst_status(
         verdict.map, DOUBTFUL if of_it else OK
     )  # of late scans nothing is of a landmark in turns: they vanish
     return replace(verdict, map=status, causes=(_of_mistake(mistake), *rest))
@@ -150,13 +150,13 @@ def _with_signs(run: Run, verdict: Verdict) -> Verdict:
     A path is at best what the map is, and a robot whose observations do not fit maps.  Where nothing is mapped, or all
     of it was known, the path is what is judged.
     """
-    found, at_end = signs(run, run.summary), [*ends(run)]
+    found, at_end = signs(run, run.summary), [*unchecked_ends(run)]
     misfit = (sign.status for _, sign in at_end if sign.status != UNCHECKED)
-    status = worst(verdict.map, *(sign.status for sign in found), *misfit)
-    robots = {name: worst(status, *(s.status for of, s in at_end if of == name)) for name in run.history.robots}
+    status = worst_status(verdict.map, *(sign.status for sign in found), *misfit)
+    robots = {name: worst_status(status, *(s.status for of, s in at_end if of == name)) for name in run.history.robots}
     if not {*run.landmarks.ids} - {*run.landmarks.exact}:
-        status = worst(status, *robots.values())
-    told = [s for s in (*found, *(s for _, s in at_end)) if worst(verdict.map, s.status) != verdict.map]
+        status = worst_status(status, *robots.values())
+    told = [s for s in (*found, *(s for _, s in at_end)) if worst_status(verdict.map, s.status) != verdict.map]
     more = [Cause(s.status if s.status == UNCHECKED else MISFIT, begin_s(run), 0.0, s.line) for s in told]
     return replace(verdict, map=status, causes=(*verdict.causes, *more), robots=robots)
 
@@ -167,7 +167,7 @@ def _of_mistake(mistake: Mistake) -> Cause:
 
 def status_of(causes: Iterable[Cause]) -> str:
     """Return the best status of a map with causes that its shape does not show."""
-    return worst(*(SEVERITY.get(cause.name, DOUBTFUL) for cause in causes if not cause.harmless))
+    return worst_status(*(SEVERITY.get(cause.name, DOUBTFUL) for cause in causes if not cause.harmless))
 
 
 def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> Verdict:
@@ -176,10 +176,10 @@ def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> 
     if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
         most = max(most, MOST)  # its reason may show in all of the log only
     try:
-        return _by_batch(run, log, first, searched(run, log, most, limit, progress))
+        return _by_batch(run, log, first, search_causes(run, log, most, limit, progress))
     except (KalmarkError, np.linalg.LinAlgError):
         found = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
-    status = worst(status_of(first), DOUBTFUL if found else OK)
+    status = worst_status(status_of(first), DOUBTFUL if found else OK)
     found = [*first, *(odd_controls(run, log) if found else ()), *found]
     none = NO_LANDMARKS if run.history.localizes else NO_MAP
     why = NO_BATCH if len(run.landmarks) else none
@@ -189,8 +189,8 @@ def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> 
 def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdict:
     """Return the verdict by a search in the batch problem, and by the causes that it cannot show, `first`."""
     effect = effect_of(run, found)
-    moved = [f for f in found.search.found if misplaced(run, f)]
-    status = worst(effect.status, status_of(first), DOUBTFUL if moved else OK)
+    moved = [f for f in found.search.found if is_misplaced_survey(run, f)]
+    status = worst_status(effect.status, status_of(first), DOUBTFUL if moved else OK)
     causes = _ordered(run, first, found, _found(run, log, first, found, effect))
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
@@ -235,7 +235,7 @@ def _all_misfit(run: Run) -> Iterator[str]:
     outcome = run.history.outcome
     if len(outcome) and not np.isin(outcome, ("associated", "new")).any():
         yield f"none of the {len(outcome)} observations was used"
-    mean = fit(run).mean
+    mean = fit_of_run(run).mean
     if MISFITS_ALL < mean < np.inf:
         yield f"d2 per degree of freedom is {figure(mean, 2)} over all observations, where 1 is expected"
 
@@ -262,7 +262,7 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
     matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
     matter = [f for f in matter if f.name != "start" or not again]
     lasting = {f.of for f in matter if f.name == "correlated_noise"}
-    causes = [(f, _cause(run, f, log)) for f in joined(matter, begin_s(run))]
+    causes = [(f, _cause(run, f, log)) for f in merge_jumps(matter, begin_s(run))]
     return [replace(c, cure="") if f.overstated and f.of in lasting else c for f, c in causes]
 
 
@@ -277,13 +277,13 @@ def _increments_s(run: Run, robot: str) -> float:
 def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.overstated
     odd = _controls(run, log, finding.of[0]).odd(since_s) if finding.name in JUMPS and log is not None else None
-    name, told = finding.name, words(finding, run.config)
+    name, told = finding.name, finding_text(finding, run.config)
     cut = (run.config.get("log") or {}).get("increments") == "cut"
     if name == LATE and not cut and 0.0 < finding.value < _increments_s(run, finding.of[0]):
         more = "a scan between two increments counts at the end of the first, which may be why"
         told = f"{told[0]}; {more}", told[1]
     if odd is not None:
-        name, told = JUMP, of_odd_control(finding, odd)
+        name, told = JUMP, odd_control_text(finding, odd)
     if name == TURNED and log is not None:
         told = f"from t={since_s:.1f} s on {told[0]}", ""
     return Cause(name, since_s, finding.gain, *told, harmless)
@@ -308,10 +308,10 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
             at = [f"{t_s:.1f}" for t_s in sorted(odd) if t_s != most.t_s]
             finding = Finding(JUMP, (robot, "", *at), 0.0, 0.0, 0.0)
             score = 0.5 * float(sum(chi2[k] for _, k in odd.values()))
-            yield Cause(JUMP, min(odd), score, *of_odd_control(finding, most))
+            yield Cause(JUMP, min(odd), score, *odd_control_text(finding, most))
 
 
-def misplaced(run: Run, finding: Finding) -> bool:
+def is_misplaced_survey(run: Run, finding: Finding) -> bool:
     """Return whether a finding is a surveyed landmark that the map has elsewhere than its sightings."""
     names = [str(id_) for id_ in run.landmarks.ids]
     if finding.name != "landmark_prior" or finding.at is None or finding.of[0] not in names:
@@ -324,16 +324,16 @@ def misplaced(run: Run, finding: Finding) -> bool:
 def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
     """Return what residuals cannot show: a place that is mapped twice still fits its data."""
     return [
-        *carried_away(run, log),
+        *find_kidnaps(run, log),
         *gaps(run),
-        *repeats(run.summary),
+        *cause_of_repeats(run.summary),
         *split_landmarks(run),
         *unseen_landmarks(run),
         *misplaced_landmarks(run),
-        *_begun_again(run),
+        *_remapped_landmarks(run),
         *fits_nothing(run),
         *off,
-        *given_up(run),
+        *abandoned_surveys(run),
         *_started_elsewhere(run),
         *_placed_elsewhere(run),
         *_lost(run),
@@ -369,7 +369,7 @@ def _placed_elsewhere(run: Run) -> Iterator[Cause]:
 
 def _lost(run: Run) -> Iterator[Cause]:
     """Yield the robots that nothing places any more at the end of the run."""
-    for one in lost(run):
+    for one in find_lost_robots(run):
         evidence = f"the last {one.number} {one.of} of {one.robot}, from t={one.since_s:.1f} s on, were left out: "
         evidence += "it is not where the path says, or they are wrong"
         cure = "look at what its controls and these say from then on, or state more noise"
@@ -378,7 +378,7 @@ def _lost(run: Run) -> Iterator[Cause]:
 
 def _left_out_until(run: Run, placed: Sequence[RelocatedRobot]) -> float:
     """Return half of the chi-square of the readings that moved a robot: those left out in a row until it was moved."""
-    h, now, score = run.history, fit(run), 0.0
+    h, now, score = run.history, fit_of_run(run), 0.0
     of = (h.robot[h.step] == placed[0].robot) & (h.sensor == placed[0].sensor)
     for one in placed:
         mine = np.flatnonzero(of & (h.t_ns[h.step] <= one.t_ns))
@@ -393,7 +393,7 @@ def misplaced_landmarks(run: Run) -> list[Cause]:
 
     What is left out is in no batch solution.  Surveys have a cause of their own.
     """
-    h, now = run.history, fit(run)
+    h, now = run.history, fit_of_run(run)
     surveyed, mapped = {prior.landmark for prior in h.priors}, {str(id_) for id_ in run.landmarks.ids}
     with_id, out, used = h.id != "", h.outcome == "rejected", h.outcome == "associated"
     rows: list[int] = []
@@ -415,7 +415,7 @@ def misplaced_landmarks(run: Run) -> list[Cause]:
     return [Cause(MISPLACED, since_s, score, evidence, cure, few)]
 
 
-def _begun_again(run: Run) -> Iterator[Cause]:
+def _remapped_landmarks(run: Run) -> Iterator[Cause]:
     """Yield the landmarks whose first sightings the filter found to be outliers, which does no harm."""
     h = run.history
     for change in (c for c in h.changes if c.reason == BEGUN_AGAIN):
@@ -429,7 +429,7 @@ def _begun_again(run: Run) -> Iterator[Cause]:
 
 def fits_nothing(run: Run) -> Iterator[Cause]:
     """Yield that most observations without an id are of no landmark in the map: it says nothing of the place."""
-    h, now = run.history, fit(run)
+    h, now = run.history, fit_of_run(run)
     mine = (h.id == "") & (h.reason != NO_ID) & ~h.of_own
     share = float(np.mean(now.values[mine] < LOST)) if mine.any() else 1.0
     if share < LEAST_SHARE:
@@ -443,8 +443,8 @@ def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]
 
     They are further off than their noise and that of the pose allow.  More noise explains nothing for sure.
     """
-    now = judged(run)
-    if not now.off() and (not now.sensors() or len(run.landmarks) or fit(run).mean < MISFITS_ALL):
+    now = fit_of_readings(run)
+    if not now.off() and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL):
         return [], False
     found, after = reasons(run, log, progress)
     causes = [replace(_of_mistake(cause), since_s=begin_s(run)) for cause in found]
@@ -456,7 +456,7 @@ def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]
         evidence = f"d2 per degree of freedom is {figure(mean, 2)} over {of}, where 1 is expected"
         cure = "state more noise for it, or look for what lasts: a bias, a delay, its mount, a wrong start"
         causes.append(Cause(MISFIT, begin_s(run), score, evidence, cure))
-    fits = after is not None and not left and fit(after.run).mean < FITS
+    fits = after is not None and not left and fit_of_run(after.run).mean < FITS
     return causes, bool(found) and found[0].name != SIGMA and fits
 
 
@@ -476,7 +476,7 @@ def _copied(run: Run, log: Log) -> list[Cause]:
     return found
 
 
-def given_up(run: Run) -> list[Cause]:
+def abandoned_surveys(run: Run) -> list[Cause]:
     """Return the surveyed landmarks that the filter found elsewhere and mapped anew, which does no harm."""
     h, found, now = run.history, [], {str(id_): k for k, id_ in enumerate(run.landmarks.ids)}
     surveys = {prior.landmark: prior for prior in h.priors}
@@ -501,7 +501,7 @@ def gaps(run: Run) -> list[Cause]:
     """
     summary, found = run.summary, []
     stops = [gap for gap in summary.get("gaps", ()) if gap["kind"] != RULED_OUT]
-    for gap in (gap for gap in stops if gap["action"] == "ignore" or matters(gap)):
+    for gap in (gap for gap in stops if gap["action"] == "ignore" or is_reported(gap)):
         lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
         anew = any(_mapped_again(run, part, gap["start_s"]) for part in summary.get("repeats", ()))
         cure = f"--set robots.{gap['robot']}.gaps=widen" if gap["action"] == "ignore" else ""
@@ -511,7 +511,7 @@ def gaps(run: Run) -> list[Cause]:
         evidence = f"the control of {gap['robot']} stops for {figure(lasts)} s{told}"
         cure = cure or ("--set upkeep.repeats=merge" if anew else "")
         found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged and not anew))
-    return found + [Cause(JUMP, begin_s, 0.0, line, "", True) for begin_s, line in left_out(summary)]
+    return found + [Cause(JUMP, begin_s, 0.0, line, "", True) for begin_s, line in controls_left_out(summary)]
 
 
 def _mapped_again(run: Run, part: dict[str, Any], t_s: float) -> bool:
@@ -523,7 +523,7 @@ def _mapped_again(run: Run, part: dict[str, Any], t_s: float) -> bool:
     return float(np.mean(before)) > MOST_PAIRS
 
 
-def repeats(summary: dict[str, Any]) -> list[Cause]:
+def cause_of_repeats(summary: dict[str, Any]) -> list[Cause]:
     """Return the parts of the map that agree, as if one place were mapped twice, as one cause: the largest of them."""
     parts = sorted(summary.get("repeats", ()), key=lambda part: -len(part["landmarks"]))
     if not parts:
@@ -535,7 +535,7 @@ def repeats(summary: dict[str, Any]) -> list[Cause]:
     return [Cause("map_repeats", since_s, score, evidence, "--set upkeep.repeats=merge")]
 
 
-def carried_away(run: Run, log: Log) -> Iterator[Cause]:
+def find_kidnaps(run: Run, log: Log) -> Iterator[Cause]:
     """Yield that a robot was carried away: what it saw until then vanished at once, and what it sees is mapped anew.
 
     Chance does not do that, or the place is in the map already.  Not if its controls had stopped: then it may have
@@ -544,10 +544,12 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
     h, repeat = run.history, next(iter(run.summary.get("repeats", ())), None)
     stops = [(gap["robot"], gap["start_s"], gap["end_s"] + STOPPED_S) for gap in run.summary.get("gaps", ())]
     moments = [
-        m for m in doubled_landmarks.vanished(run) if not any(m.robot == r and a <= m.t_s <= b for r, a, b in stops)
+        m
+        for m in doubled_landmarks.vanished_landmarks(run)
+        if not any(m.robot == r and a <= m.t_s <= b for r, a, b in stops)
     ]
     far_m, again = float(np.linalg.norm(repeat["shift_m"])) if repeat else 0.0, list[doubled_landmarks.Moment]()
-    if repeat and far_m > doubled_landmarks.spacing(run):
+    if repeat and far_m > doubled_landmarks.landmark_spacing(run):
         last = int(np.searchsorted(h.t_ns, round((repeat["start_s"] or 0.0) * 1e9)))
         again = [moment for moment in moments if last - doubled_landmarks.NEAR_SCANS <= moment.step <= last]
     first = max(again or moments, key=lambda moment: (moment.score, moment.number), default=None)
@@ -559,14 +561,14 @@ def carried_away(run: Run, log: Log) -> Iterator[Cause]:
     score = max(first.score, repeat["score"] if repeat and again else 0.0)
     odd = _controls(run, log, first.robot).odd(first.t_s)
     if odd is not None:
-        yield Cause(JUMP, odd.t_s, score, *of_odd_control(Finding(JUMP, (first.robot, ""), 0.0, 0.0, 0.0), odd))
+        yield Cause(JUMP, odd.t_s, score, *odd_control_text(Finding(JUMP, (first.robot, ""), 0.0, 0.0, 0.0), odd))
         return
     yield Cause("kidnapped", first.t_s, score, evidence)
 
 
 def split_landmarks(run: Run) -> Iterator[Cause]:
     """Yield that things are in the map twice, side by side: their landmarks are seen in turn, never together."""
-    pairs = doubled_landmarks.split(run)
+    pairs = doubled_landmarks.find_split_landmarks(run)
     if pairs:
         number, mapped = len({pair.name for pair in pairs}), len(run.landmarks)
         first = ", ".join(f"{pair.name} and {pair.other}" for pair in pairs[:LISTED])
@@ -584,7 +586,7 @@ def unseen_landmarks(run: Run) -> Iterator[Cause]:
     Of landmarks that are there a share `FEW` is marked by chance.  Where ids say what was seen, the times are counted
     at which landmarks came into view as before.
     """
-    marks, h, found = run.landmarks, run.history, doubled_landmarks.unseen(run)
+    marks, h, found = run.landmarks, run.history, doubled_landmarks.unseen_counts(run)
     names = [name for name in marks.ids if name in marks.unseen]
     by_chance = float(pdtrc(len(names) - 1, FEW * len(marks))) > LIKELY if names else True
     if names:
@@ -656,10 +658,10 @@ def effect_of(run: Run, found: Searched) -> Effect:
     status = OK if not off_it else DOUBTFUL if share < MOST_OFF else WRONG
     shift_m = max(shift_m, by_steady)  # told, but no alarm: under noise that is stated too small it is too much
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
-    same_data = not waited and not of_the_filter_alone(run.final_slam())  # what waited is not in the batch solution
+    same_data = not waited and not filter_only_sensors(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data
     claimed = float(np.median(ratio)) if comparable else None
-    twice = repeated_events.of_scans(run).any()
+    twice = repeated_events.repeated_scans(run).any()
     over = 1.0 / claimed if claimed is not None and (claimed < TOO_SURE or twice) else 1.0
     factors = np.hypot(honest[free] / stated[free] * over, shift_m / filtered[free])
     accuracy_m = float(np.median(factors * filtered[free]))

@@ -25,16 +25,16 @@ from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter import parallax
 from kalmark.filter.gauge_transport import (
     carry,
-    displaced,
-    frame_of,
+    displacement_columns,
+    extend_rows,
     gauge,
     heading_last,
     is_level,
-    leaning,
+    regression_on_units,
+    rotation_at,
+    turn_matrices,
     turning_rows,
-    turns_of,
     units,
-    widened,
 )
 from kalmark.filter.kernels import (
     RAISED,
@@ -43,29 +43,29 @@ from kalmark.filter.kernels import (
     downdate,
     downdate_and_transport,
     lower_product,
-    rows_of,
     submatrix,
+    take_rows,
     transport,
 )
 from kalmark.filter.observed_block import (
     Linear,
-    chosen,
     diagonal_blocks,
+    has_settled,
     head_sizes,
     innovation,
     joint_innovation,
     least_squares,
-    linearized,
+    observation_of,
     observed_block,
-    raveled,
-    settled,
+    ravel,
+    select_observations,
     sparse_product,
     squared_distances,
-    stacked,
+    stack_jacobians,
     transport_rows,
-    within,
+    within_gate,
 )
-from kalmark.filter.parallax import anchored
+from kalmark.filter.parallax import inverse_distance_table
 from kalmark.geometry.spaces import Table, generator, generator_plane, retract, retract_plane
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
@@ -115,7 +115,7 @@ def compile_correction(name: str, option: str, axes: int, inverse_depths: bool) 
 
 
 @compiled
-def observed(map_: Map, scan: Scan, slots: Index) -> tuple[Index, Table, Array, Sizes]:
+def observed_rows(map_: Map, scan: Scan, slots: Index) -> tuple[Index, Table, Array, Sizes]:
     """Return the `observed_block` of these slots, the rows of other units that turn behind its head, and its sizes.
 
     These are the numbers of the pose and of the head, the axes of the gauge, the rows of the head and of other units,
@@ -127,13 +127,13 @@ def observed(map_: Map, scan: Scan, slots: Index) -> tuple[Index, Table, Array, 
     others, h = units(atoms, blocks[scan[0], 2]), 3 if pose == 3 else 6
     h += blocks[scan[1], 3] if scan[1] >= 0 else 0
     if len(others):
-        index, table = widened(index, table, h, others)
+        index, table = extend_rows(index, table, h, others)
     level = is_level(atoms, blocks[scan[0], 4], blocks[scan[0], 5])
     return index, table, mean, (pose, head, axes, h, len(others), level)
 
 
 @compiled
-def taken(values: Array, index: Index) -> Array:
+def take_values(values: Array, index: Index) -> Array:
     """Return values[index]."""
     out = np.empty(len(index))
     for i in range(len(index)):
@@ -142,7 +142,7 @@ def taken(values: Array, index: Index) -> Array:
 
 
 @compiled
-def picked(index: Index, rows: Index) -> Index:
+def take_indices(index: Index, rows: Index) -> Index:
     """Return index[rows]."""
     out = np.empty(len(rows), np.int64)
     for i in range(len(rows)):
@@ -168,12 +168,12 @@ def iterate(
     turning = turning_rows(table, sizes, linear[1])
     theta = turning[0]
     correction, origin = np.zeros(len(P_ss)), mean[:3].copy()
-    R_r = frame_of(mean, 0, axes)
-    L = leaning(rows_of(P_ss, theta, len(P_ss)), theta, table, turning, axes, R_r, ways[_SPREAD] != 0)
+    R_r = rotation_at(mean, 0, axes)
+    L = regression_on_units(take_rows(P_ss, theta, len(P_ss)), theta, table, turning, axes, R_r, ways[_SPREAD] != 0)
     then = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
     turn = np.zeros(axes)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
-    depths = anchored(table if parallaxes else table[:0])
+    depths = inverse_distance_table(table if parallaxes else table[:0])
     v, H, HP, Z = linear
     s, S = s_j, S_j = v, HP  # of the types of a sensor's place and Jacobian, which only inverse distances need
     baselines = (depths, s, S, s)
@@ -182,27 +182,27 @@ def iterate(
         rows = np.arange(S.shape[1])
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P_ss, rows, mean, s, S, depths)))
         s_j, S_j = s, S
-    x_j, (E, W, d) = mean, turns_of(turn, correction, turning, axes)
+    x_j, (E, W, d) = mean, turn_matrices(turn, correction, turning, axes)
     for j in range(most):
         if j > 0:
             _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, (len(mean) - head) // k), y)
-            H, v = stacked(E_r, E_l, len(P_ss)), raveled(z)
+            H, v = stack_jacobians(E_r, E_l, len(P_ss)), ravel(z)
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            a = displaced(table, now, then, L, E, d, turning, theta, R_r, frame_of(x_j, 0, axes), level)
+            a = displacement_columns(table, now, then, L, E, d, turning, theta, R_r, rotation_at(x_j, 0, axes), level)
             transport_rows(H, v, a, theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, h + others)
         M, positive = cholesky_inverse(Z)
         if not positive:
             break
         before, correction = correction, least_squares(HP, M, v)
-        if settled(table, correction, before, P_ss, tolerance):
+        if has_settled(table, correction, before, P_ss, tolerance):
             break
         x_j = mean.copy()
         turn = gauge(mean, correction, turning, axes)
         step = heading_last(correction, turn, level, 3)
-        E, W, d = turns_of(turn, step, turning, axes)
+        E, W, d = turn_matrices(turn, step, turning, axes)
         call_retract(ways[_RETRACT], (table, x_j, step, turn))
         carry(table, x_j, L, W, d)
         if len(depths):
@@ -283,47 +283,47 @@ def invariant(
     """
     x, P, n, blocks, atoms, axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
-    index, table, mean, sizes = observed(map_, scan, slots)
+    index, table, mean, sizes = observed_rows(map_, scan, slots)
     head, h = sizes[1], sizes[3]
     e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     P_ss = submatrix(P, index)
-    linear = linearized(z, E_r, E_l, P_ss, R)
+    linear = observation_of(z, E_r, E_l, P_ss, R)
     Z = diagonal_blocks(linear[3], z.shape[1])
     d2, valid = squared_distances(Z, z)
-    near, count = within(d2, gate)
+    near, count = within_gate(d2, gate)
     if count == 0:
         return e, z, Z, d2, near, valid
     if count < len(near):
-        slots, y, R = chosen(near, count, slots, y, R)
-        index, table, mean, sizes = observed(map_, scan, slots)
+        slots, y, R = select_observations(near, count, slots, y, R)
+        index, table, mean, sizes = observed_rows(map_, scan, slots)
         P_ss = submatrix(P, index)
         _e, z_near, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(count, d), y)
-        linear = linearized(z_near, E_r, E_l, P_ss, R)
+        linear = observation_of(z_near, E_r, E_l, P_ss, R)
     H, M, v, positive = iterated(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
     if not positive:
-        return e, z, Z, d2, within(d2, -1.0)[0], False
+        return e, z, Z, d2, within_gate(d2, -1.0)[0], False
     at, origin = blocks[robot, 0], mean[:3].copy()
     turning = turning_rows(table, sizes, linear[1])
-    theta = picked(index, turning[0])
-    R_r = frame_of(x, at, axes)
-    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
+    theta = take_indices(index, turning[0])
+    R_r = rotation_at(x, at, axes)
+    L = regression_on_units(take_rows(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
     then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    V, correction = gain(sparse_product(H, rows_of(P, index, n), h + sizes[4], count), M, v)
-    depths = anchored(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
+    V, correction = gain(sparse_product(H, take_rows(P, index, n), h + sizes[4], count), M, v)
+    depths = inverse_distance_table(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
     s, S = v, H  # of the types, as in `iterate`
     rows, baselines, x_before = index[:h], (depths, s, S, s), x
     if len(depths):
         s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
         x_before = x.copy()
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
-    own = taken(correction, index)
+    own = take_values(correction, index)
     turn = gauge(mean, own, turning, axes)
     step = heading_last(correction, turn, sizes[5], blocks[robot, 2] + 3)
-    E, W, d_lean = turns_of(turn, taken(step, index), turning, axes)
+    E, W, d_lean = turn_matrices(turn, take_values(step, index), turning, axes)
     call_retract(ways[_RETRACT], (atoms, x, step, turn))
     carry(atoms, x, L, W, d_lean)
     now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    a = displaced(atoms, now, then, L, E, d_lean, turning, theta, R_r, frame_of(x, at, axes), sizes[5])
+    a = displacement_columns(atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5])
     downdate_and_transport(P, V, a, theta)
     if len(depths):
         observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
@@ -333,7 +333,7 @@ def invariant(
     return e, z, Z, d2, near, valid
 
 
-def compared(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
+def innovation_covariances(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
     """Return each observation's innovation covariance Z (K, p, p) and d2 (K,); nothing is corrected.  [S] (83)."""
     x, P, _n, blocks, atoms, _axes, _ways = map_
     robot, mount, slots, d, y, R, _gate = scan
@@ -344,7 +344,7 @@ def compared(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
     return Z, d2
 
 
-def weighed(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
+def robust_noise(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     """Return R (K, p, p) divided by robust weights of what a scan leaves of each whitened innovation r.
 
     Huber's min(1, k / |r|), or Student's min(1, (k + p) / (k + |r|^2)) of k degrees of freedom; k is in the place of
@@ -360,7 +360,7 @@ def weighed(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     for i in range(len(y)):
         if np.isnan(z[i]).any():  # it has no expectation: it does not change the others
             z[i], E_r[i], E_l[i] = 0.0, 0.0, 0.0
-    P_ss, H, v, inflated = submatrix(P, index), stacked(E_r, E_l, len(index)), raveled(z), R.copy()
+    P_ss, H, v, inflated = submatrix(P, index), stack_jacobians(E_r, E_l, len(index)), ravel(z), R.copy()
     r = np.empty((len(y), p))
     for _ in range(ROUNDS):
         HP, Z = joint_innovation(H, P_ss, inflated, E_r.shape[2])
@@ -386,15 +386,15 @@ def weighed(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     return inflated
 
 
-def fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
+def scan_fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
     """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if not valid."""
     P, ways = map_[1], map_[6]
     _robot, _mount, slots, d, y, R, _gate = scan
-    index, table, mean, sizes = observed(map_, scan, slots)
+    index, table, mean, sizes = observed_rows(map_, scan, slots)
     head = sizes[1]
     _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
     P_ss = submatrix(P, index)
-    linear = linearized(z, E_r, E_l, P_ss, R)
+    linear = observation_of(z, E_r, E_l, P_ss, R)
     _H, M, v, positive = iterated(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
     if not positive:
         return np.inf, np.inf
@@ -404,7 +404,7 @@ def fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[f
     return (w * w).sum(), log_det
 
 
-def averaged(
+def correct_by_average(
     model: Any, map_: Map, scan: Scan, limits: tuple[int, float], pairs: Index, weights: Array, transports: bool
 ) -> tuple[Array, bool]:
     """Correct by the mean over H matchings: x <- sum w_h x_h, P <- sum w_h (P_h + (x_h - x) (x_h - x)').  [F], JPDA.
@@ -415,7 +415,7 @@ def averaged(
     """
     x, P, n, blocks, atoms, axes, ways = map_
     robot, _mount, slots, d, y, R, _gate = scan
-    index, table, mean, sizes = observed(map_, scan, slots[:0])
+    index, table, mean, sizes = observed_rows(map_, scan, slots[:0])
     (_pose, head, _axes, h, others, _level), q = sizes, R.shape[1]
     V, D, H = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, h))
     d2, used = np.full(len(y), np.nan), 0
@@ -423,25 +423,25 @@ def averaged(
         rows = np.flatnonzero(pairs[i] >= 0)
         if len(rows) == 0:
             continue
-        index, table, mean, sizes = observed(map_, scan, slots[pairs[i][rows]])
+        index, table, mean, sizes = observed_rows(map_, scan, slots[pairs[i][rows]])
         _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(rows), d), y[rows])
         if i == 0:
             d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
         S = submatrix(P, index)
-        linear = linearized(z, E_r, E_l, S, R[rows])
+        linear = observation_of(z, E_r, E_l, S, R[rows])
         H, M, v, positive = iterated(model, ways, sizes, table, mean, S, y[rows], R[rows], linear, limits)
         if not positive:
             return d2, False
-        V_i, D[:, i] = gain(sparse_product(H, rows_of(P, index, n), h + others, len(rows)), M, v)
+        V_i, D[:, i] = gain(sparse_product(H, take_rows(P, index, n), h + others, len(rows)), M, v)
         V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
         used += len(V_i)
-    index, table, mean, sizes = observed(map_, scan, slots[:0])
+    index, table, mean, sizes = observed_rows(map_, scan, slots[:0])
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
     at, origin, turning = blocks[robot, 0], mean[:3].copy(), turning_rows(table, sizes, H)
-    theta, own = picked(index, turning[0]), correction[index]
-    R_r = frame_of(x, at, axes)
-    L = leaning(rows_of(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
+    theta, own = take_indices(index, turning[0]), correction[index]
+    R_r = rotation_at(x, at, axes)
+    L = regression_on_units(take_rows(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
     then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     step, turn = correction, gauge(mean, own, turning, axes) if transports else np.zeros(0)
     if transports:
@@ -450,10 +450,12 @@ def averaged(
     downdate(P, V)
     add_square(P, spread)
     if transports:
-        E, W, d_lean = turns_of(turn, taken(step, index), turning, axes)
+        E, W, d_lean = turn_matrices(turn, take_values(step, index), turning, axes)
         carry(atoms, x, L, W, d_lean)
         now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-        a = displaced(atoms, now, then, L, E, d_lean, turning, theta, R_r, frame_of(x, at, axes), sizes[5])
+        a = displacement_columns(
+            atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5]
+        )
         transport(P, a, theta)
     return d2, True
 
@@ -471,7 +473,7 @@ def textbook(
     e, z, Z, d2 = np.empty((k, y.shape[1])), np.empty((k, p)), np.empty((k, p, p)), np.empty(k)
     near, valid, head = np.zeros(k, np.bool_), True, head_sizes(blocks, atoms, robot, mount)[1]
     index, _table, _mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
-    rows, V = rows_of(P, index, n), np.zeros((k * p, n))
+    rows, V = take_rows(P, index, n), np.zeros((k * p, n))
     for i in range(k):
         one = slice(i, i + 1)
         _index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots[one], d)
@@ -513,24 +515,24 @@ def first_estimates(
     e, z, _, _ = linearize(model, mean[:head], mean[head:].reshape(k, d), y)
     _, _, E_r, E_l = linearize(model, first[:head], first[head:].reshape(k, d), y)
     Z, d2, valid = innovation(P, index, E_r, E_l, R, z)
-    near, count = within(d2, gate)
+    near, count = within_gate(d2, gate)
     if count == 0:
         return e, z, Z, d2, near, valid
     index, _, _ = observed_block(x, blocks, atoms, robot, mount, slots[near], d)
-    H = stacked(E_r[near], E_l[near], len(index))
+    H = stack_jacobians(E_r[near], E_l[near], len(index))
     M, positive = cholesky_inverse(joint_innovation(H, submatrix(P, index), R[near], E_r.shape[2])[1])
     if not positive:
-        return e, z, Z, d2, within(d2, -1.0)[0], False
-    V, correction = gain(sparse_product(H, rows_of(P, index, n), E_r.shape[2], count), M, z[near].ravel())
+        return e, z, Z, d2, within_gate(d2, -1.0)[0], False
+    V, correction = gain(sparse_product(H, take_rows(P, index, n), E_r.shape[2], count), M, z[near].ravel())
     downdate(P, V)
     call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
     return e, z, Z, d2, near, valid
 
 
 compiled_invariant = compiled(invariant)
-compiled_compared = compiled(compared)
-compiled_weighed = compiled(weighed)
-compiled_fit = compiled(fit)
-compiled_averaged = compiled(averaged)
+compiled_compared = compiled(innovation_covariances)
+compiled_weighed = compiled(robust_noise)
+compiled_fit = compiled(scan_fit)
+compiled_averaged = compiled(correct_by_average)
 compiled_textbook = compiled(textbook)
 compiled_first_estimates = compiled(first_estimates)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_check
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.compiled import ahead
+from kalmark.compiled import compile_on_second_core
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
 from kalmark.filter.inertial_errors import has_units, turn_own_errors
@@ -155,13 +155,13 @@ class _Estimator:
     def compile_ahead(self, axes: int, inverse_depths: bool) -> None:
         """Begin to compile the correction of a map of these axes on a second core."""
         job, cls = corrections.compile_correction, type(self)
-        ahead(corrections.compiled_iterate, job, cls.source.__name__, cls.option, axes, inverse_depths)
+        compile_on_second_core(corrections.compiled_iterate, job, cls.source.__name__, cls.option, axes, inverse_depths)
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
         model, robot, added, *control = movement
         m, robot, _, here = map_.movable(robot, added)
-        run: Any = prediction.compiled_predicted if isinstance(model, tuple) else prediction.predicted
+        run: Any = prediction.compiled_predicted if isinstance(model, tuple) else prediction.predict
         where = m.x, m.x_first, m.P, m.n, m.blocks, m.atoms, corrections.generator_address(m.axes)
         return bool(run(where, (model, robot, here, *control), self.from_first, self.transports and m.axes == 6))
 
@@ -210,7 +210,7 @@ class _Estimator:
         Returns d2 (K,) of the pairs of the first one, and whether the covariances are valid.
         """
         model, *scan = update[:-1]
-        run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.averaged
+        run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.correct_by_average
         m, robot_here, _, _ = map_.opened(update.robot, update.mount, update.slots, self.transports)
         before = m.x.copy() if self.transports and has_units(m) else None
         d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)

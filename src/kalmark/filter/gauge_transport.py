@@ -18,7 +18,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter.kernels import RAISED, cholesky_inverse, product
-from kalmark.filter.observed_block import transposed
+from kalmark.filter.observed_block import transpose
 from kalmark.geometry.angles import exponential_v
 from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
 from kalmark.geometry.spaces import ANGLE, LINEAR, OWN, ROTATION, SCALAR, TURNED, VECTOR, Table
@@ -64,7 +64,7 @@ def about_vertical(E: Array) -> Array:
 def heading_last(correction: Array, turn: Array, level: int, at: int) -> Array:
     """Return the correction (n,) that moves the mean: a unit whose rotation is at the row `at` is tilted first.
 
-    Then it turns by its heading, S(psi) Exp(tau): its errors of tilt tau turn by psi, in `displaced`.
+    Then it turns by its heading, S(psi) Exp(tau): its errors of tilt tau turn by psi, in `displacement_columns`.
     """
     if level == 0:
         return correction
@@ -79,7 +79,7 @@ def heading_last(correction: Array, turn: Array, level: int, at: int) -> Array:
 
 
 @compiled
-def widened(index: Index, table: Table, head: int, rows: Index) -> tuple[Index, Table]:
+def extend_rows(index: Index, table: Table, head: int, rows: Index) -> tuple[Index, Table]:
     """Return the rows of P and the atoms of an observed block that has further rows of P behind those of its head."""
     k, out, moved = len(rows), np.empty(len(index) + len(rows), np.int64), table.copy()
     for i in range(len(out)):
@@ -121,7 +121,7 @@ def turning_rows(table: Table, sizes: tuple[int, int, int, int, int, int], H: Ar
 
 
 @compiled
-def frame_of(x: Array, at: int, axes: int) -> Array:
+def rotation_at(x: Array, at: int, axes: int) -> Array:
     """Return R_r of the rotation of the pose at this place of a mean x: (3, 3) in space, (1, 1) in the plane."""
     if axes == 1:
         return np.eye(1)
@@ -142,7 +142,7 @@ def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
     for a in range(axes):
         turn[a] = correction[rows[a]]
     if turns > 0:  # of the sensor: d_theta + R_r d_theta_s
-        R = frame_of(mean, 0, axes)
+        R = rotation_at(mean, 0, axes)
         for a in range(turns):
             for c in range(turns):
                 turn[axes - turns + a] += R[a, c] * correction[rows[axes + c]]
@@ -154,7 +154,9 @@ def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
 
 
 @compiled
-def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array, rays: bool) -> Array:
+def regression_on_units(
+    B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array, rays: bool
+) -> Array:
     """Return L (n, m): regression of each vector of some atoms on the m rows of a mount and of other units' rotations.
 
     `B` (k, n) are the rows of P, before the correction, of all rows that turn; `index` are these rows, R that of the
@@ -167,7 +169,7 @@ def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R
     L, robot = np.zeros((B.shape[1], m)), index[axes - t]
     if m == 0:
         return L
-    W = weights(B, index, axes - t)
+    W = inverse_covariance(B, index, axes - t)
     for c in range(turns):  # dependence on the robot's rotation is that on the sensor's, d_theta + R_r d_theta_s
         for a in range(t):
             for b in range(t + m):
@@ -181,7 +183,7 @@ def leaning(B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R
 
 
 @compiled
-def weights(B: Array, index: Index, first: int) -> Array:
+def inverse_covariance(B: Array, index: Index, first: int) -> Array:
     """Return S^-1 of the covariance S of the rows B of P from `first` on, at `index`; 0 where S is singular."""
     S = np.empty((len(index) - first, len(index) - first))
     for i in range(len(S)):
@@ -189,7 +191,7 @@ def weights(B: Array, index: Index, first: int) -> Array:
             S[i, j] = B[first + i, index[first + j]]
         S[i, i] += RAISED * max(S[i, i], 1.0)
     M, positive = cholesky_inverse(S)
-    return product(transposed(M), M) if positive else np.zeros(S.shape)
+    return product(transpose(M), M) if positive else np.zeros(S.shape)
 
 
 @compiled
@@ -212,7 +214,7 @@ def rotation_of(turn: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def turns_of(turn: Array, correction: Array, turning: Turning, axes: int) -> tuple[Array, Array, Array]:
+def turn_matrices(turn: Array, correction: Array, turning: Turning, axes: int) -> tuple[Array, Array, Array]:
     """Return E - 1 and W - V (m, s, s) of the m rows that others depend on, and their errors (m,) by a correction.
 
     A dependent part becomes E of it, and moves the mean by W, where a vector moves by V otherwise: V of the gauge's
@@ -258,7 +260,7 @@ def carry(atoms: Table, x: Array, L: Array, W: Array, d: Array) -> None:
 
 
 @compiled
-def displaced(
+def displacement_columns(
     atoms: Table, now: Array, then: Array, L: Array, E: Array, d: Array, turning: Turning, index: Index, R: Array,
     R_now: Array, level: int,
 ) -> Array:  # fmt: skip
@@ -275,8 +277,8 @@ def displaced(
     for i in range(n):
         for a in range(axes):
             out[i, a] = now[i, a] - then[i, a]
-    L = with_arm(out, L, d, axes, turns)
-    lean(out, atoms, L, E, axes, first + arm, index)
+    L = add_arm(out, L, d, axes, turns)
+    apply_regression(out, atoms, L, E, axes, first + arm, index)
     for i in range(n):  # other units turn by d_theta_r - d_theta
         for c in range(first + arm, len(index)):
             out[i, axes - 3 + (c - first - arm) % 3] -= out[i, c]
@@ -286,7 +288,7 @@ def displaced(
                 out[i, axes + c] += out[i, axes - turns + a] * R[a, c]
             out[index[axes - turns + a], axes + c] -= R_now[a, c] - R[a, c]
     if level:
-        E_z = about_vertical(product(R_now, transposed(R)))
+        E_z = about_vertical(product(R_now, transpose(R)))
         for a in range(3):
             for b in range(3):
                 out[index[axes - 3 + a], axes - 3 + b] += E_z[a, b] - (1.0 if a == b else 0.0)
@@ -294,7 +296,7 @@ def displaced(
 
 
 @compiled
-def with_arm(out: Array, L: Array, d: Array, axes: int, turns: int) -> Array:
+def add_arm(out: Array, L: Array, d: Array, axes: int, turns: int) -> Array:
     """Return L of a mount's rotation with its arm as corrected, by d (m,): L_a x d_a more, which is added to `out`."""
     L = L.copy() if turns else L
     for i in range(len(L) if turns else 0):
@@ -307,7 +309,7 @@ def with_arm(out: Array, L: Array, d: Array, axes: int, turns: int) -> Array:
 
 
 @compiled
-def lean(out: Array, atoms: Table, L: Array, E: Array, axes: int, others: int, index: Index) -> None:
+def apply_regression(out: Array, atoms: Table, L: Array, E: Array, axes: int, others: int, index: Index) -> None:
     """Set the last columns of `out` (n, .), those of a mount and from `others` on of other units, to (E - 1) L.
 
     A vector of a unit's own turns with it by its generator, in the first columns, whatever it depends on.

@@ -29,11 +29,11 @@ def turn_own_errors(map_: StochasticMap, robot: int, before: Array) -> None:
     """Let the errors of each inertial unit turn as it did in a correction, by `robot`, of the whole mean `before`."""
     for slot, space in enumerate(map_.spaces):
         if space is not None and space.kinds[: len(UNIT)] == UNIT:
-            T = carried(space, before[map_.numbers(slot)], map_.mean(slot), slot == robot)
+            T = error_transport(space, before[map_.numbers(slot)], map_.mean(slot), slot == robot)
             map_.predict(map_.index(slot), T, np.zeros((space.dof, space.dof)))
 
 
-def carried(space: Space, before: Array, after: Array, observes: bool) -> Array:
+def error_transport(space: Space, before: Array, after: Array, observes: bool) -> Array:
     """Return T (dof, dof): the errors d (dof,) of an inertial unit, corrected from `before` to `after`, become T d.
 
     Attitude, velocity and gravity turn as the attitude did, about the vertical alone where that is known, so that the

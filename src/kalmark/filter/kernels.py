@@ -67,7 +67,7 @@ def one_thread() -> Any:
 
 
 @compiled
-def rows_of(P: Array, index: Index, n: int) -> Array:
+def take_rows(P: Array, index: Index, n: int) -> Array:
     """Return P[index, :n] (k, n)."""
     k = len(index)
     B = np.empty((k, n))
@@ -173,7 +173,7 @@ def moved_noise(moved: Array, F: Array, R_u: Array, N: Array) -> tuple[Array, bo
 @compiled
 def predict(P: Array, n: int, index: Index, F: Array, Q: Array) -> None:
     """P <- F P F' + Q, F and Q (k, k) acting on the rows `index`.  [S] (15)-(17).  O(n)."""
-    B = product(F, rows_of(P, index, n))
+    B = product(F, take_rows(P, index, n))
     block = quadratic(F, submatrix(P, index)) + Q
     for a in range(len(index)):
         for b in range(len(index)):
@@ -194,7 +194,7 @@ def any_product(A: Array, B: Array) -> Array:
 @compiled
 def augment(P: Array, n: int, rows: Index, index: Index, G: Array, Q: Array) -> None:
     """Append blocks at `rows` (d,): P_Lx = G P_x, P_LL = G P G' + Q, G (d, k) on the rows `index`.  [S] (35)-(38)."""
-    B = any_product(G, rows_of(P, index, n))
+    B = any_product(G, take_rows(P, index, n))
     GP, G_T = np.empty(G.shape), np.empty((G.shape[1], len(G)))
     for a in range(len(rows)):
         for c in range(len(index)):
@@ -207,7 +207,7 @@ def augment(P: Array, n: int, rows: Index, index: Index, G: Array, Q: Array) -> 
 
 
 @compiled
-def clear(P: Array, n: int, at: int, d: int) -> None:
+def clear_block(P: Array, n: int, at: int, d: int) -> None:
     """Set the rows and columns at..at+d of P (n, n) to zero: a removed block, or a new one that is known exactly."""
     for a in range(at, at + d):
         for b in range(a + 1):
@@ -302,7 +302,7 @@ def transport(P: Array, a: Array, theta: Index) -> None:
         for j in range(n):
             w_T[c, j] = P[t, j] if j <= t else P[j, t]
             a_T[c, j] = a[j, c]
-    half_turned(w_T, a_T, theta)
+    add_half_turn(w_T, a_T, theta)
     for c in range(axes):
         for i in range(n):
             a_i, w_i = a_T[c, i], w_T[c, i]
@@ -311,7 +311,7 @@ def transport(P: Array, a: Array, theta: Index) -> None:
 
 
 @compiled
-def half_turned(w: Array, a: Array, theta: Index) -> None:
+def add_half_turn(w: Array, a: Array, theta: Index) -> None:
     """Add half of P[theta, theta] a to the rows w = P[theta] (axes, n), in place."""
     axes, n = w.shape
     half = np.empty((axes, axes))
@@ -357,7 +357,7 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: Index) -> None:
             v = V[i, t]
             for j in range(n):
                 w[c, j] -= v * V[i, j]
-    half_turned(w, a_T, theta)
+    add_half_turn(w, a_T, theta)
     if n <= CACHED:
         subtract_squares(P, V, a_T, w)
         return

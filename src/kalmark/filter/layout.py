@@ -168,7 +168,7 @@ def _appended(table: Table, rows: Table) -> Table:
 
 
 @compiled
-def laid_out(blocks: Table, atoms: Table) -> tuple[Table, Table, Index, Index]:
+def concatenate_tables(blocks: Table, atoms: Table) -> tuple[Table, Table, Index, Index]:
     """Return the tables of these blocks, one after the other, and the numbers and rows they had before."""
     own, table = np.empty_like(blocks), np.empty((blocks[:, 5].sum(), 3), np.int64)
     numbers, rows = np.empty(blocks[:, 1].sum(), np.int64), np.empty(blocks[:, 3].sum(), np.int64)

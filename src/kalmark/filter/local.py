@@ -13,16 +13,16 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.filter import kernels
-from kalmark.filter.layout import laid_out
+from kalmark.filter.layout import concatenate_tables
 from kalmark.filter.map import Marginal, StochasticMap
 from kalmark.geometry.spaces import Space
 
 
-def beside(read: Marginal, spaces: Sequence[Space], means: Sequence[Array]) -> Marginal:
+def append_known(read: Marginal, spaces: Sequence[Space], means: Sequence[Array]) -> Marginal:
     """Return a joint marginal with blocks known exactly behind its own; their slots come last."""
     m, robot, mount, slots = read
     head = [robot] if mount < 0 else [robot, mount]
-    blocks, atoms, numbers, rows = laid_out(m.blocks[np.concatenate([head, slots]).astype(np.int64)], m.atoms)
+    blocks, atoms, numbers, rows = concatenate_tables(m.blocks[np.concatenate([head, slots]).astype(np.int64)], m.atoms)
     n, x_n, own = len(rows), len(numbers), len(blocks)
     sizes, dofs = [space.size for space in spaces], [space.dof for space in spaces]
     x_at, p_at = [*accumulate(sizes, initial=x_n)], [*accumulate(dofs, initial=n)]

@@ -15,8 +15,8 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import CAPACITY, P_AT, P_SIZE, Layout, Read, State, next_capacity, spaces_of
-from kalmark.filter.nearest_blocks import Sorts, distances, near_places, paired
-from kalmark.filter.nearest_of_each import Asked, Nearest, Seen, nearest
+from kalmark.filter.nearest_blocks import Sorts, distances, near_places, nearest_pairs
+from kalmark.filter.nearest_of_each import Asked, Nearest, Seen, nearest_landmarks
 from kalmark.filter.prefault import Prefault
 from kalmark.geometry.spaces import Space, Table
 
@@ -48,7 +48,7 @@ class Pairs(NamedTuple):
     @classmethod
     def of(cls, slots: Index, places: Array, read: Marginal | None, p: Array, nearest: int, farther: float) -> Pairs:
         """Return the pairs of p (K, d) and blocks at `places` (N, d): the `nearest` of each, as `limits` has it."""
-        rows, numbers, used = paired(p, places, nearest, farther)
+        rows, numbers, used = nearest_pairs(p, places, nearest, farther)
         marginal = None if read is None else read._replace(slots=read.slots[used])
         return cls(rows, numbers, slots[used], places[used], marginal)
 
@@ -188,7 +188,7 @@ class StochasticMap(Layout):
 
     def nearest(self, model: Any, scan: Seen, asked: Asked) -> Nearest | None:
         """Return the only wanted block that each observation can be of; None of a scan of which that is not clear."""
-        clear, found = nearest(model, self.whole, scan, np.arange(len(self.blocks)), asked)
+        clear, found = nearest_landmarks(model, self.whole, scan, np.arange(len(self.blocks)), asked)
         return Nearest(*found) if clear else None
 
     def around(self, sorts: Sorts, p: Array, count: int) -> Index:
@@ -202,7 +202,7 @@ class StochasticMap(Layout):
         """Add a block that is independent of all others (`cov` None: known exactly); return its slot."""
         slot = self._place(space, np.asarray(mean, dtype=np.float64))
         at, d = self.blocks[slot, P_AT], self.blocks[slot, P_SIZE]
-        kernels.clear(self.P, self.n, at, d)
+        kernels.clear_block(self.P, self.n, at, d)
         if cov is not None:
             self.P[at : at + d, at : at + d] = cov
         return slot
@@ -220,7 +220,7 @@ class StochasticMap(Layout):
 
     def remove(self, slot: int) -> None:
         """Marginalise a block out; its slot is free for another of its shape.  [S] Table 1, state reduction."""
-        kernels.clear(self.P, self.n, self.blocks[slot, P_AT], self.blocks[slot, P_SIZE])
+        kernels.clear_block(self.P, self.n, self.blocks[slot, P_AT], self.blocks[slot, P_SIZE])
         self._vacate(slot)
 
     def reset(self) -> None:

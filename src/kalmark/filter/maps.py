@@ -28,13 +28,13 @@ def new_map(type_: str, numbers: str) -> Map:
     return CompressedMap(Triangle(NUMBERS[numbers])) if type_ == "postponed" else StochasticMap()
 
 
-def grown(map_: Map, landmarks: Iterable[Space], numbers: str) -> Map:
+def compress_if_large(map_: Map, landmarks: Iterable[Space], numbers: str) -> Map:
     """Return a dense map as a compressed one where it pays: from DENSE landmarks on, inverse distances not counted."""
     if not isinstance(map_, StochasticMap) or sum(RHO not in space.kinds for space in landmarks) <= DENSE:
         return map_
     return CompressedMap.from_dense(map_, Triangle(NUMBERS[numbers]))
 
 
-def restored(state: State, read: Read) -> Map:
+def restore_map(state: State, read: Read) -> Map:
     """Build the map of a file from what `state` and `arrays` of a map have written."""
-    return compressed.restored(state, read) if "postponed" in state else StochasticMap.restored(state, read)
+    return compressed.restore_compressed(state, read) if "postponed" in state else StochasticMap.restored(state, read)

@@ -42,7 +42,7 @@ def distances(p: Array, places: Array) -> Array:
 
 
 @compiled
-def least(gaps: Array, count: int) -> float:
+def kth_least(gaps: Array, count: int) -> float:
     """Return the `count`-th least of some gaps (N,), inf where there are fewer."""
     if not 0 < count <= len(gaps):
         return np.inf
@@ -64,12 +64,12 @@ def limits(gaps: Array, nearest: int, farther: float) -> Array:
     """Return the distance (K,) of the `nearest`-th of each row of gaps (K, N), at most `farther` times the least."""
     out = np.empty(len(gaps))
     for k in range(len(gaps)):
-        out[k] = min(farther * max(least(gaps[k], 1), TINY_M), least(gaps[k], nearest))
+        out[k] = min(farther * max(kth_least(gaps[k], 1), TINY_M), kth_least(gaps[k], nearest))
     return out
 
 
 @compiled
-def paired(p: Array, places: Array, nearest: int, farther: float) -> tuple[Index, Index, Index]:
+def nearest_pairs(p: Array, places: Array, nearest: int, farther: float) -> tuple[Index, Index, Index]:
     """Return rows of p (K, d) and numbers of places (N, d), both (M,): of each p the nearest, within its `limits`.
 
     The places are numbered in the order in which they are found: `used` (L,) has which they are.
@@ -92,7 +92,7 @@ def paired(p: Array, places: Array, nearest: int, farther: float) -> tuple[Index
 
 
 @compiled
-def wanted(x: Array, blocks: Table, slots: Index, sorts: Sorts, d: int) -> tuple[Index, Array]:
+def wanted_places(x: Array, blocks: Table, slots: Index, sorts: Sorts, d: int) -> tuple[Index, Array]:
     """Return which of the `blocks` are wanted (N,), and where they are (N, d); `slots` are theirs, -1 for none."""
     here = np.empty(len(slots), np.int64)
     n = 0
@@ -115,7 +115,7 @@ def near_places(
 
     `slots` are those of the `blocks`, -1 for none.
     """
-    here, places = wanted(x, blocks, slots, sorts, p.shape[1])
+    here, places = wanted_places(x, blocks, slots, sorts, p.shape[1])
     gaps = distances(p, places)
     limit, found = limits(gaps, nearest, farther), np.zeros(len(here), np.bool_)
     for k in range(len(p)):

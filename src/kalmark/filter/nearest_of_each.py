@@ -11,12 +11,12 @@ from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter.corrections import Map
 from kalmark.filter.kernels import cholesky_inverse
-from kalmark.filter.nearest_blocks import Sorts, distance, paired, wanted
+from kalmark.filter.nearest_blocks import Sorts, distance, nearest_pairs, wanted_places
 from kalmark.filter.observed_block import head_sizes, innovation, observed_block
 from kalmark.models.observe import linearize
 
 Seen = tuple[int, int, int, Array, Array]  # slots of robot and mount, numbers of a landmark, y (K, m), R (K, p, p)
-Asked = tuple[Sorts, Array, int, float, float]  # wanted sorts, places, most, farther, gate: see `nearest`
+Asked = tuple[Sorts, Array, int, float, float]  # wanted sorts, places, most, farther, gate: see `nearest_landmarks`
 
 
 class Nearest(NamedTuple):
@@ -38,7 +38,7 @@ class Nearest(NamedTuple):
 
 
 @compiled
-def nearest(
+def nearest_landmarks(
     model: Any, map_: Map, scan: Seen, slots: Index, asked: Asked
 ) -> tuple[bool, tuple[Index, Array, Array, Array, Index, Index, Array, Index, Array]]:  # fmt: skip
     """Return the `Nearest` of a scan, and whether each observation is of another block and within the gate on d2.
@@ -50,8 +50,8 @@ def nearest(
     x, P, _n, blocks, atoms, _axes, _ways = map_
     robot, mount, d, y, R = scan
     sorts, p, most, farther, gate = asked
-    here, places = wanted(x, blocks, slots, sorts, p.shape[1])
-    rows, numbers, used = paired(p, places, most, farther)
+    here, places = wanted_places(x, blocks, slots, sorts, p.shape[1])
+    rows, numbers, used = nearest_pairs(p, places, most, farther)
     named, l = np.empty(len(used), np.int64), np.empty((len(used), p.shape[1]))
     for i in range(len(used)):
         named[i] = slots[here[used[i]]]
@@ -62,7 +62,7 @@ def nearest(
     head = head_sizes(blocks, atoms, robot, mount)[1]
     _e, z, E_h, E_l = linearize(model, mean[:head], mean[head:].reshape(len(rows), d), y_own)
     Z, compared, _valid = innovation(P, index, E_h, E_l, R_own, z)
-    best, limit = _best(p, rows, numbers, compared, l, most, farther)
+    best, limit = _best_pairs(p, rows, numbers, compared, l, most, farther)
     at, d2, sigma, clear = np.full(len(p), -1), np.full(len(p), np.inf), np.full(len(p), np.inf), True
     for k in range(len(p)):
         if best[k] >= 0:
@@ -91,7 +91,7 @@ def _of_pairs(
 
 
 @compiled
-def _best(
+def _best_pairs(
     p: Array, rows: Index, numbers: Index, d2: Array, places: Array, most: int, farther: float
 ) -> tuple[Index, Array]:  # fmt: skip
     """Return the pair (K,) of least d2 of each observation, -1 for none, and how far off others may be (K,)."""

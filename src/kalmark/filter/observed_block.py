@@ -57,7 +57,7 @@ def observed_block(
 
 
 @compiled
-def concatenated(E_r: Array, E_l: Array, H: Array) -> None:
+def concatenate(E_r: Array, E_l: Array, H: Array) -> None:
     """Set H (p, h + d) to (E_r, E_l), element by element: numba compiles the check of a slice's shape for 2 s."""
     head = E_r.shape[1]
     for a in range(len(H)):
@@ -78,7 +78,7 @@ def innovation(P: Array, index: Index, E_r: Array, E_l: Array, R: Array, z: Arra
     S = np.empty((n, n))
     kernels.copy_submatrix(P, index[:head], S)
     for i in range(k):
-        concatenated(E_r[i], E_l[i], H)
+        concatenate(E_r[i], E_l[i], H)
         own = index[head + i * d] if d > 0 else 0
         for a in range(head, n):
             row = own + a - head
@@ -135,7 +135,7 @@ def squared_distances(Z: Array, z: Array) -> tuple[Array, bool]:
 
 
 @compiled
-def stacked(E_r: Array, E_l: Array, n: int) -> Array:
+def stack_jacobians(E_r: Array, E_l: Array, n: int) -> Array:
     """Return the Jacobian H (K p, n) of all observations of a scan with respect to the observed block of n rows.
 
     It is zero in rows between those of the head and those of the landmarks.
@@ -188,19 +188,19 @@ def add_blocks(S: Array, R: Array) -> None:
 
 
 @compiled
-def linearized(z: Array, E_r: Array, E_l: Array, P_ss: Array, R: Array) -> Linear:
+def observation_of(z: Array, E_r: Array, E_l: Array, P_ss: Array, R: Array) -> Linear:
     """Return a scan whose innovations are z (K, p), Jacobians E_r and E_l and noise R (K, p, p) as one observation.
 
     P_ss is the covariance of the observed block.
     """
     k, _p, d = E_l.shape
-    H = stacked(E_r, E_l, len(P_ss))
+    H = stack_jacobians(E_r, E_l, len(P_ss))
     HP, Z = joint_innovation(H, P_ss, R, len(P_ss) - k * d)
-    return raveled(z), H, HP, Z
+    return ravel(z), H, HP, Z
 
 
 @compiled
-def raveled(z: Array) -> Array:
+def ravel(z: Array) -> Array:
     """Return innovations z (K, p) as one (K p,)."""
     k, p = z.shape
     v = np.empty(k * p)
@@ -214,13 +214,13 @@ def raveled(z: Array) -> Array:
 def joint_innovation(H: Array, P_ss: Array, R: Array, head: int) -> tuple[Array, Array]:
     """Return H P and Z = H P H' + blockdiag(R) of all observations, R (K, p, p)."""
     HP = sparse_product(H, P_ss, head, len(R))
-    Z = sparse_product(H, transposed(HP), head, len(R))
+    Z = sparse_product(H, transpose(HP), head, len(R))
     add_blocks(Z, R)
     return HP, Z
 
 
 @compiled
-def transposed(A: Array) -> Array:
+def transpose(A: Array) -> Array:
     """Return A' (n, m) of A (m, n)."""
     out = np.empty((A.shape[1], len(A)))
     for i in range(len(A)):
@@ -230,7 +230,7 @@ def transposed(A: Array) -> Array:
 
 
 @compiled
-def within(d2: Array, gate: float) -> tuple[Flags, int]:
+def within_gate(d2: Array, gate: float) -> tuple[Flags, int]:
     """Return which squared distances (K,) are finite and within the gate, and how many."""
     near, count = np.zeros(len(d2), np.bool_), 0
     for i in range(len(d2)):
@@ -241,7 +241,7 @@ def within(d2: Array, gate: float) -> tuple[Flags, int]:
 
 
 @compiled
-def chosen(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[Index, Array, Array]:
+def select_observations(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[Index, Array, Array]:
     """Return those `count` of slots (K,), measurements y (K, m) and noises R (K, p, p) that are `near`."""
     p = R.shape[1]
     slots_near, y_near, R_near = np.empty(count, np.int64), np.empty((count, y.shape[1])), np.empty((count, p, p))
@@ -303,7 +303,7 @@ def least_squares(HP: Array, M: Array, v: Array) -> Array:
 
 
 @compiled
-def settled(table: Table, now: Array, before: Array, P: Array, tolerance: float) -> bool:
+def has_settled(table: Table, now: Array, before: Array, P: Array, tolerance: float) -> bool:
     """Return whether each atom of a mean moves by less than that many of its sigmas between two corrections.
 
     However the world is turned.

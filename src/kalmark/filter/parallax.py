@@ -8,8 +8,8 @@ that keeps its meaning from x- to x+, just as xi does.  c2 = trace Cov(t) at the
 than its own uncertainty, rho is corrected as it is.  In space an anchor is an atom ANCHOR, in the plane the vector that
 a block with RHO begins with.
 
-A table of the `anchored` has the rows (rho's place in x and in P, its anchor's place in x and in P).  The sensor is
-at s, (2 or 3,), with the Jacobian S (., h) in the head: the robot's pose and, if it is in the map, the mount.
+`inverse_distance_table` has the rows (rho's place in x and in P, its anchor's place in x and in P).  The sensor is at
+s, (2 or 3,), with the Jacobian S (., h) in the head: the robot's pose and, if it is in the map, the mount.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
-from kalmark.filter.kernels import quadratic, rows_of, submatrix
+from kalmark.filter.kernels import quadratic, submatrix, take_rows
 from kalmark.geometry.spaces import ANCHOR, KIND, P_AT, RHO, VECTOR, X_AT, Table
 
 Baselines = tuple[Table, Array, Array, Array]  # of the anchored at the prediction: table, s, S, c2
@@ -34,15 +34,15 @@ call_carry_back, call_transport = by_address(CARRY_BACK), by_address(TRANSPORT)
 
 
 def addresses() -> tuple[int, int, int, int]:
-    """Return the addresses of `spread`, `retract_parallax`, `carry_back` and `transport_parallax`, compiled now."""
+    """Return the addresses of the four functions below that are called by address, compiled now."""
     return (
-        address_of(spread, SPREAD), address_of(retract_parallax, RETRACT), address_of(carry_back, CARRY_BACK),
-        address_of(transport_parallax, TRANSPORT),
+        address_of(baseline_variances, SPREAD), address_of(retract_parallax, RETRACT),
+        address_of(carry_back, CARRY_BACK), address_of(transport_parallax, TRANSPORT),
     )  # fmt: skip
 
 
 @compiled
-def anchored(atoms: Table) -> Table:
+def inverse_distance_table(atoms: Table) -> Table:
     """Return the table (N, 4) of the inverse distances among the atoms; an anchor counts for all that follow it."""
     rows = np.empty((len(atoms), 4), np.int64)
     count = anchor = 0
@@ -57,7 +57,7 @@ def anchored(atoms: Table) -> Table:
 
 
 @compiled
-def spread(P: Array, head: Index, x: Array, s: Array, S: Array, table: Table) -> Array:
+def baseline_variances(P: Array, head: Index, x: Array, s: Array, S: Array, table: Table) -> Array:
     """Return c2 = trace Cov(s - a) of each row of the table; `head` are the rows of P of the head.
 
     In the plane it is that of t without its turn with the robot's heading, which does not change its length.
@@ -111,7 +111,7 @@ def retract_parallax(x: Array, before: Array, baselines: Baselines, d: Array, d_
 
 
 @compiled
-def carried(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: Array) -> Array:
+def inverse_distance_error_terms(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: Array) -> Array:
     """Return what rho's error at x is made of (N, h + 3 + 1): of the errors of head, anchor and rho.
 
     All errors are those at x, after the transport by the generator, but rho's own, which is the one before.
@@ -154,9 +154,9 @@ def carried(before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: 
 
 @compiled
 def carry_back(H: Array, before: Array, x: Array, baselines: Baselines, s_now: Array, S_now: Array) -> None:
-    """H <- H T in place, T the map of errors that `carried` describes; the head is H's first columns."""
+    """H <- H T in place, T the map of errors of `inverse_distance_error_terms`; the head is H's first columns."""
     table, head = baselines[0], S_now.shape[1]
-    C = carried(before, x, baselines, s_now, S_now)
+    C = inverse_distance_error_terms(before, x, baselines, s_now, S_now)
     last = C.shape[1] - 1
     for i in range(len(table)):
         p, anchor = table[i, RHO_P], table[i, ANCHOR_P]
@@ -182,18 +182,18 @@ def transport_parallax(
 ) -> None:  # fmt: skip
     """P <- T P T' in place, on the lower triangle: one row and one column of each inverse distance.  O(N n).
 
-    T is the map of errors that `carried` describes.
+    T is the map of errors that `inverse_distance_error_terms` describes.
     """
-    table, C = baselines[0], carried(before, x, baselines, s_now, S_now)
+    table, C = baselines[0], inverse_distance_error_terms(before, x, baselines, s_now, S_now)
     h, count = len(head), len(table)
     size = C.shape[1] - h - 1
     X = np.zeros((count, n))  # (T - I) P at the rows of rho
-    common, own = rows_of(P, head, n), np.empty(size + 1, np.int64)
+    common, own = take_rows(P, head, n), np.empty(size + 1, np.int64)
     for i in range(count):
         for k in range(size):
             own[k] = table[i, ANCHOR_P] + k
         own[size] = table[i, RHO_P]
-        rows = rows_of(P, own, n)
+        rows = take_rows(P, own, n)
         C[i, h + size] -= 1.0
         add_combined(X, i, C, 0, common)
         add_combined(X, i, C, h, rows)

@@ -23,7 +23,7 @@ Motion = tuple[Any, int, Index, bool, Array, Array, Array, Array, float]  # as `
 
 
 @compiled
-def in_world(state: Array, D: Array) -> Array:
+def noise_in_world(state: Array, D: Array) -> Array:
     """Return a noise D (k, k) of the robot's frame in the world's: in the plane (3 or more), in space (6 or more)."""
     k = len(D)
     G = np.eye(k)
@@ -41,7 +41,7 @@ def in_world(state: Array, D: Array) -> Array:
 
 
 @compiled
-def joined(F: Array, R_a: Array, Q: Array, shared: bool) -> tuple[Array, Array]:
+def append_constants(F: Array, R_a: Array, Q: Array, shared: bool) -> tuple[Array, Array]:
     """Return F and Q (n + c, .) of a robot and the constants that change its control, R_a (n, c) by these.
 
     With a `shared` error the control's noise is among the constants.
@@ -60,7 +60,7 @@ def joined(F: Array, R_a: Array, Q: Array, shared: bool) -> tuple[Array, Array]:
 
 
 @compiled
-def transported(F: Array, now: Array, then: Array, at: int) -> Array:
+def transport_jacobian(F: Array, now: Array, then: Array, at: int) -> Array:
     """Return F (I + (now - then) e_theta'), the rows `at` and following of two generators (n, axes)."""
     axes, out = now.shape[1], F.copy()
     theta = 2 if axes == 1 else 3
@@ -94,7 +94,7 @@ def spread_rays(P: Array, atoms: Table, Q: Array) -> None:
                         P[k + a, l + b] += c * Q[a, b]
 
 
-def predicted(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
+def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     """Move a robot in a map; return whether all of it is finite: if not, nothing has changed.
 
     `from_first`: displacements count from the first estimates, F (I + (generator(x) - generator(x_first)) e_theta').
@@ -118,13 +118,13 @@ def predicted(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> boo
         axes, origin = 1 if size < 7 else 3, np.zeros(3)
         now = call_generator(turns, (atoms, x, n, axes, origin))
         then = call_generator(turns, (atoms, x_first, n, axes, origin))
-        F = transported(F, now, then, p_at)
+        F = transport_jacobian(F, now, then, p_at)
     Q, valid = kernels.moved_noise(moved, F, R_u, N)  # the last term of [S] (15)
     if not valid:
         return False
-    F, Q = joined(F, kernels.product(R_u, B), Q, shared)
+    F, Q = append_constants(F, kernels.product(R_u, B), Q, shared)
     if len(D):
-        Q_D = in_world(moved, D)
+        Q_D = noise_in_world(moved, D)
         for i in range(len(D)):
             for j in range(len(D)):
                 Q[i, j] += Q_D[i, j]
@@ -136,4 +136,4 @@ def predicted(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> boo
     return True
 
 
-compiled_predicted = compiled(predicted)
+compiled_predicted = compiled(predict)

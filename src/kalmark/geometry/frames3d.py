@@ -55,7 +55,7 @@ def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
 @compiled
 def inverse(a: Array) -> tuple[Array, Array]:
     """Return the inverse frame b, with b o a = identity, and B_a (6, 6)."""
-    q = rotations.normalised(rotations.conjugate(a[3:]))
+    q = rotations.normalize(rotations.conjugate(a[3:]))
     Q = rotations.matrix(q)
     b = np.empty(7)
     b[:3] = -(Q @ a[:3].copy())

@@ -100,7 +100,7 @@ def merge(a: Any, A: Any, b: Any, B: Any) -> tuple[Array, Array]:
     return c, (C + C.T) / 2
 
 
-def between(a: Any, b: Any) -> tuple[Array, Array, Array]:
+def relative_frame(a: Any, b: Any) -> tuple[Array, Array, Array]:
     """Return the frame b as seen from the frame a, c = a^-1 o b (3,), with C_a and C_b (3, 3)."""
     back, A_a = inverse(np.array(a, dtype=np.float64))
     c, C_back, C_b = compose(back, np.array(b, dtype=np.float64))

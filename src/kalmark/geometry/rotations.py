@@ -24,7 +24,7 @@ def skew(v: Array) -> Array:
 
 
 @compiled
-def normalised(q: Array) -> Array:
+def normalize(q: Array) -> Array:
     """Return q (4,) divided by its norm."""
     return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
 
@@ -32,7 +32,7 @@ def normalised(q: Array) -> Array:
 @compiled
 def multiply(a: Array, b: Array) -> Array:
     """Return the normalised product (4,) of two unit quaternions a, b (4,): the rotation b, then a."""
-    return normalised(
+    return normalize(
         np.array(
             [
                 a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1],
@@ -80,7 +80,7 @@ def from_matrix(Q: Array) -> Array:
         q[i] = 1 + 2 * Q[i, i] - trace
         q[j], q[k] = Q[j, i] + Q[i, j], Q[k, i] + Q[i, k]
         q[3] = Q[k, j] - Q[j, k]
-    return normalised(q) if q[3] >= 0 else normalised(-q)
+    return normalize(q) if q[3] >= 0 else normalize(-q)
 
 
 @compiled

@@ -21,9 +21,9 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import shown
+from kalmark.events import short_text
 from kalmark.geometry.named_poses import describe_pose
-from kalmark.logs.source import frame, mapping, nearest, number
+from kalmark.logs.source import frame, number_of_text, read_mapping, spelling_hint
 
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
 LENSES = {
@@ -41,10 +41,10 @@ def lens(model: str, coefficients: Sequence[float]) -> dict[str, Any]:
     """Return the keys of a lens, by the name that programs have for it.  Raises ValueError: value and expectation."""
     name, d = LENSES.get(model.lower()), [float(each) for each in coefficients]
     if name is None:
-        raise ValueError(f"distortion_model is {shown(model)}, expected one of {', '.join(LENSES)}")
+        raise ValueError(f"distortion_model is {short_text(model)}, expected one of {', '.join(LENSES)}")
     most = COEFFICIENTS[name]
     if any(d[most:]):
-        raise ValueError(f"distortion is {shown(d)}, expected at most the {most} coefficients of {name}")
+        raise ValueError(f"distortion is {short_text(d)}, expected at most the {most} coefficients of {name}")
     d = d[:most]
     return {"lens": name, "distortion": d + [0.0] * (4 - len(d)) if name == "radtan" and any(d) else d}
 
@@ -54,9 +54,9 @@ def read_calibration(path: Path, camera: str | None = None) -> dict[str, Any]:
 
     `camera` names one of several in the file.  Raises LogError: file, key, value and what was expected.
     """
-    found = dict(_cameras(mapping(path), ""))
+    found = dict(_cameras(read_mapping(path), ""))
     if camera is not None and camera not in found:
-        hint = nearest(camera, found)
+        hint = spelling_hint(camera, found)
         raise LogError(
             f"{path}: no camera {camera!r}, expected one of {', '.join(filter(None, found)) or 'none'}{hint}"
         )
@@ -166,7 +166,7 @@ class _Calibration:
         """Return a number, quoted or not."""
         value = self.content.get(key)
         try:
-            return number(str(value))
+            return number_of_text(str(value))
         except ValueError:
             raise self.error(key, value, "a finite number") from None
 
@@ -178,7 +178,7 @@ class _Calibration:
             [v for row in given for v in (row if isinstance(row, list) else [row])] if isinstance(given, list) else []
         )
         try:
-            out = [number(str(value)) for value in flat]
+            out = [number_of_text(str(value)) for value in flat]
         except ValueError:
             out = []
         if not isinstance(given, list) or len(out) != len(flat) or len(out) not in sizes:
@@ -187,4 +187,4 @@ class _Calibration:
 
     def error(self, key: str, value: Any, wanted: str) -> LogError:
         """Return the error of a value that should have been something else."""
-        return LogError(f"{self.path}: {key} is {shown(value)}, expected {wanted}")
+        return LogError(f"{self.path}: {key} is {short_text(value)}, expected {wanted}")

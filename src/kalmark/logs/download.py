@@ -26,8 +26,8 @@ from urllib.parse import quote, urlsplit
 import platformdirs
 
 from kalmark.errors import DataError, LogError
-from kalmark.files import locked, refuse_bomb, unpacked
-from kalmark.logs.source import nearest
+from kalmark.files import hold_lock, refuse_bomb, unpack_file
+from kalmark.logs.source import spelling_hint
 
 ORIGIN = "https://raw.githubusercontent.com/{repo}/{commit}/{path}"
 ELSEWHERE = "set KALMARK_DATA to a folder that has it or KALMARK_DATA_URL to a mirror"
@@ -126,7 +126,7 @@ def _not_fetched(name: str) -> DataError:
     if plain in own:
         return DataError(f"dataset {plain!r} cannot be fetched, expected a copy of your own: put {own[plain]}")
     near = [one for one in (*names, *own) if name and one.lower().startswith(plain.lower())]
-    hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else nearest(name, (*names, *own))
+    hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else spelling_hint(name, (*names, *own))
     known = f"one of {', '.join(names)}, or, as a copy of your own, {', '.join(own)}"
     return DataError(f"dataset {name!r} is unknown, expected {known}{hint}")
 
@@ -141,7 +141,7 @@ def fetch_one(dataset: Dataset, progress: Progress | None) -> Path:
     root = cache_folder()
     with suppress(OSError):  # `download` says so
         root.mkdir(parents=True, exist_ok=True)
-    with locked(root):  # of two programs one downloads
+    with hold_lock(root):  # of two programs one downloads
         there = ((root / file.file, file.sha256) for file in dataset.files)
         if not all(path.is_file() and sha256(path) == wanted for path, wanted in there):
             download(dataset, root, progress)
@@ -177,14 +177,14 @@ def retrieve(file: DataFile, place: Path, transfer: Transfer) -> None:
     try:
         pooch.HTTPDownloader(progressbar=transfer, timeout=30)(where, str(place), None)
     except (requests.ConnectionError, requests.Timeout) as error:
-        raise DataError(f"cannot reach {urlsplit(where).netloc} ({innermost(error)}); {ELSEWHERE}") from None
+        raise DataError(f"cannot reach {urlsplit(where).netloc} ({innermost_reason(error)}); {ELSEWHERE}") from None
     except (requests.RequestException, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{file.file}: cannot be fetched ({reason}), expected it at {where}") from None
     check(place, file)
 
 
-def innermost(error: BaseException) -> str:
+def innermost_reason(error: BaseException) -> str:
     """Return in a few words what is at the bottom of an error of the network."""
     seen = [error]
     while True:
@@ -258,7 +258,7 @@ def unpack(path: Path) -> None:
                 archive.extractall(path.parent)  # strips absolute paths and ".."
             return
         with path.with_suffix("").open("wb") as plain:
-            plain.writelines(unpacked(path, DataError))
+            plain.writelines(unpack_file(path, DataError))
     except (zipfile.BadZipFile, EOFError, OSError) as error:
         raise DataError(f"{path.name}: cannot be unpacked ({error}), expected a complete archive") from None
 

@@ -12,15 +12,15 @@ from typing import Any, Literal
 import numpy as np
 
 from kalmark.errors import LogError, PluginError, one_line
-from kalmark.events import Event, Fix, Scan, order, shown
+from kalmark.events import Event, Fix, Scan, short_text, sort_key
 from kalmark.logs.download import find_data
-from kalmark.logs.increments import cut
+from kalmark.logs.increments import cut_increments
 from kalmark.logs.log import Log
-from kalmark.logs.log_corrections import corrected
+from kalmark.logs.log_corrections import correct_log
 from kalmark.logs.native import NATIVE, stream
 from kalmark.logs.overflow import refuse_overflow
 from kalmark.logs.poses import KITTI, TUM, read_path
-from kalmark.logs.source import Format, Request, choice, nearest, quantity, raising
+from kalmark.logs.source import Format, Request, choice, quantity, raise_refusal, spelling_hint
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3
 from kalmark.plugins import load_all
 
@@ -74,18 +74,18 @@ def open_log(
     """
     entry, found = recognise(find_data(path), format)
     entry.refuse_options(options)
-    request = requested(robot_names(robots, entry.robot_prefix), on_error, progress)
-    log = corrected(entry.read(found, request, **options), factors, shift_s)
+    request = request_of(robot_names(robots, entry.robot_prefix), on_error, progress)
+    log = correct_log(entry.read(found, request, **options), factors, shift_s)
     refuse_overflow(log)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m, sigma_fixes_z_m)
-    log = selected(log, request, from_s, to_s, ids)
+    log = select_events(log, request, from_s, to_s, ids)
     chosen = {
         "from_s": from_s, "to_s": to_s, "on_error": on_error, "ids": ids, "factors": factors, "shift_s": shift_s,
         "truth": _names(log, "truth", truth), "fixes": _names(log, "fixes", fixes), "sigma_fixes_m": sigma_fixes_m,
         "sigma_fixes_z_m": sigma_fixes_z_m, "increments": increments, **options,
     }  # fmt: skip
     log = replace(log, options={name: value for name, value in chosen.items() if value is not None})
-    return cut(log) if choice(increments, "increments", ("recorded", "cut")) == "cut" else log
+    return cut_increments(log) if choice(increments, "increments", ("recorded", "cut")) == "cut" else log
 
 
 def stream_log(
@@ -98,24 +98,24 @@ def stream_log(
     bad row when it is reached.
     """
     _, found = recognise(find_data(path), NATIVE.name)
-    request = requested(robot_names(robots), on_error, progress)
+    request = request_of(robot_names(robots), on_error, progress)
     return (event for event in stream(found, request) if request.wants(event.robot))
 
 
-def requested(robots: tuple[str, ...] | None, on_error: str, progress: bool = False) -> Request:
+def request_of(robots: tuple[str, ...] | None, on_error: str, progress: bool = False) -> Request:
     """Return what the caller asked for.  Raises LogError."""
     skipped: list[str] = []
     refuse = (
-        raising
+        raise_refusal
         if choice(on_error, "on_error", ("raise", "skip")) == "raise"
         else lambda line: skipped.append(one_line(line))
     )
     return Request(robots, refuse, skipped, progress)
 
 
-def selected(log: Log, request: Request, from_s: float | None, to_s: float | None, ids: str) -> Log:
+def select_events(log: Log, request: Request, from_s: float | None, to_s: float | None, ids: str) -> Log:
     """Return the robots, the time and the ids of a log that were asked for.  Raises LogError."""
-    log = between(keep_robots(log, request), from_s, to_s)
+    log = clip_time(keep_robots(log, request), from_s, to_s)
     return hide_ids(log) if choice(ids, "ids", ("given", "hidden")) == "hidden" else log
 
 
@@ -126,7 +126,7 @@ def with_poses(
     true = {robot: read_path(path, request) for robot, path in _by_robot(log, "truth", truth).items()}
     places = {robot: read_path(path, request) for robot, path in _by_robot(log, "fixes", fixes).items()}
     if (sigma_m is None) != (fixes is None) or (sigma_m is None and sigma_z_m is not None):
-        both = f"fixes is {shown(fixes)} and sigma_fixes_m is {shown(sigma_m)}"
+        both = f"fixes is {short_text(fixes)} and sigma_fixes_m is {short_text(sigma_m)}"
         raise LogError(f"log option {both}, expected both: a file of positions and their noise")
     given = ((sigma_m, "sigma_fixes_m"), (sigma_z_m, "sigma_fixes_z_m"))
     sigmas = [quantity(sigma, name, 1e-9) for sigma, name in given if sigma is not None]
@@ -136,7 +136,7 @@ def with_poses(
         for d in (_dimensions(log, robot),)
         for t_ns, pose in zip(path.t_ns.tolist(), path.poses, strict=True)
     ]
-    found = sorted([*log.events, *events], key=order) if events else log.events
+    found = sorted([*log.events, *events], key=sort_key) if events else log.events
     return replace(log, events=found, truth=log.truth | true) if true or events else log
 
 
@@ -146,7 +146,7 @@ def _by_robot(log: Log, name: str, given: Any) -> dict[str, Path]:
     for robot in files:
         if robot not in log.robots or (len(files) > 1 and not isinstance(given, Mapping)):
             wanted = f"a file, or one for each of the robots {', '.join(log.robots)}: {{robot: file}}"
-            raise LogError(f"log option {name} is {shown(given)}, expected {wanted}")
+            raise LogError(f"log option {name} is {short_text(given)}, expected {wanted}")
     return {robot: find_data(path) for robot, path in files.items()}
 
 
@@ -168,7 +168,9 @@ def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
         if format in missing:
             raise LogError(f"log format is {format!r}: {missing[format]}")
         if format not in known:
-            raise LogError(f"log format is {format!r}, expected one of {', '.join(known)}{nearest(format, known)}")
+            raise LogError(
+                f"log format is {format!r}, expected one of {', '.join(known)}{spelling_hint(format, known)}"
+            )
         found = known[format].find(path)
         if found is None:
             raise LogError(f"{path}: not a log of format {format}, expected {known[format].what}")
@@ -201,32 +203,32 @@ def keep_robots(log: Log, request: Request) -> Log:
         return log
     for robot in request.robots:
         if robot not in log.robots:
-            hint = nearest(robot, log.robots)
+            hint = spelling_hint(robot, log.robots)
             raise LogError(f"{log.path or log.name}: no robot {robot!r}, expected one of {', '.join(log.robots)}{hint}")
     entry = known_formats().get(log.format)
     others = {*log.robots, *(entry.robots if entry else ())} - {*request.robots}
     left_out: Counter[str] = Counter()
-    kept = (without(event, others, left_out) for event in log if event.robot in request.robots)
+    kept = (remove_sightings(event, others, left_out) for event in log if event.robot in request.robots)
     events = [event for event in kept if event is not None]
     for robot, count in sorted(left_out.items()):
         request.leave_out(count, f"{log.path or log.name}: {count} sightings of {robot}, which was not asked for")
     names, rig = request.robots, log.describes
     if "robots" in rig:
-        rig = rig | {"robots": kept_of(rig["robots"], (*names, "each"))}
+        rig = rig | {"robots": select_robots(rig["robots"], (*names, "each"))}
     by_robot: dict[str, Any] = {
-        field: kept_of(getattr(log, field), names) for field in ("truth", "gps", "control_columns")
+        field: select_robots(getattr(log, field), names) for field in ("truth", "gps", "control_columns")
     }
     sensors = {key: value for key, value in log.sensor_columns.items() if key[0] in names}
     robots = tuple(robot for robot in log.robots if robot in names)
     return replace(log, robots=robots, events=events, sensor_columns=sensors, describes=rig, **by_robot)
 
 
-def kept_of(table: dict[str, Any], robots: Sequence[str]) -> dict[str, Any]:
+def select_robots(table: dict[str, Any], robots: Sequence[str]) -> dict[str, Any]:
     """Return what a table by robot has of these robots."""
     return {name: value for name, value in table.items() if name in robots}
 
 
-def without(event: Event, others: set[str], left_out: Counter[str]) -> Event | None:
+def remove_sightings(event: Event, others: set[str], left_out: Counter[str]) -> Event | None:
     """Return the event without the sightings of these robots, or None if nothing else was seen."""
     if not isinstance(event, Scan) or event.ids is None or others.isdisjoint(event.ids):
         return event
@@ -239,7 +241,7 @@ def without(event: Event, others: set[str], left_out: Counter[str]) -> Event | N
     return Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor, y=event.y[keep], ids=ids, cov=cov)
 
 
-def between(log: Log, from_s: float | None, to_s: float | None) -> Log:
+def clip_time(log: Log, from_s: float | None, to_s: float | None) -> Log:
     """Return the log with the events from `from_s` to `to_s` (both included), s from its first event."""
     if not log.events and log.format in (TUM.name, KITTI.name):
         return log

@@ -19,7 +19,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import shown
+from kalmark.events import short_text
 
 A_M = 6378137.0
 FLATTENING = 1 / 298.257223563
@@ -35,7 +35,7 @@ def earth_centred(lla: Any) -> Array:
     return np.stack([across * np.cos(lon), across * np.sin(lon), ((1 - E2) * n + h) * np.sin(lat)], axis=-1)
 
 
-def local(lla: Any, origin: Any) -> Array:
+def to_tangent_plane(lla: Any, origin: Any) -> Array:
     """Return positions (..., 3) = latitude, longitude (deg), height (m) as east, north, up (m) of an origin (3,)."""
     origin = np.asarray(origin, dtype=np.float64)
     lat, lon = np.radians(origin[:2])
@@ -62,7 +62,7 @@ def origin_of(given: Any, what: str) -> Array | None:
     except (TypeError, ValueError):
         lla = np.zeros(0)
     if lla.shape not in ((2,), (3,)) or not np.isfinite(lla).all() or fault(lla):
-        raise LogError(f"{what} is {shown(given)}, expected [latitude_deg, longitude_deg, height_m]")
+        raise LogError(f"{what} is {short_text(given)}, expected [latitude_deg, longitude_deg, height_m]")
     return np.append(lla, np.zeros(3 - len(lla)))
 
 
@@ -80,4 +80,4 @@ class Globe:
         lla = np.array(lla, dtype=np.float64)
         if self.origin is None:
             self.origin = np.append(lla, np.zeros(3 - len(lla)))
-        return local(np.append(lla, self.origin[len(lla) :]), self.origin)
+        return to_tangent_plane(np.append(lla, self.origin[len(lla) :]), self.origin)

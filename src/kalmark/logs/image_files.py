@@ -117,7 +117,7 @@ def write_depth(path: Path, depth: Array) -> None:
     write_image(path, np.where(numbers <= np.iinfo(np.uint16).max, numbers, 0).astype(np.uint16))
 
 
-def size_of(frames: Iterable[Frame]) -> dict[str, int]:
+def image_size(frames: Iterable[Frame]) -> dict[str, int]:
     """Return the size of the first image that can be read, as a camera's configuration has it.  Raises ImageError."""
     wrong: ImageError | None = None
     for frame in frames:

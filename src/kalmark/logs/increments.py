@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.events import Control, Event, Scan, order
+from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.geometry.angles import V, V_inverse
 from kalmark.geometry.rotations import left_jacobian, left_jacobian_inverse
 from kalmark.logs.log import Log
@@ -26,7 +26,7 @@ LONG = 5  # usual intervals: a longer one may be of a gap, of which the incremen
 CUT = INCREMENT2, INCREMENT3, WHEELS  # columns of increments that can be cut
 
 
-def cut(log: Log) -> Log:
+def cut_increments(log: Log) -> Log:
     """Return a log with its increments cut at the scans, frames and fixes between their ends.
 
     Those of a robot are cut, too, where another one says by its name that it sees it.
@@ -40,7 +40,7 @@ def cut(log: Log) -> Log:
         controls = [event for event in log.events if isinstance(event, Control) and event.robot == robot]
         columns = tuple(log.control_columns.get(robot, ()))
         events += _parts(controls, columns, sorted(asked[robot])) if columns in CUT else controls
-    return replace(log, events=sorted(events, key=order))
+    return replace(log, events=sorted(events, key=sort_key))
 
 
 def _parts(controls: list[Control], columns: tuple[str, ...], asked: list[int]) -> Iterator[Control]:

@@ -6,8 +6,8 @@ import json
 from typing import Any
 
 from kalmark.errors import EventError
-from kalmark.events import Control, Event, Fix, Scan, shown
-from kalmark.logs.source import nearest
+from kalmark.events import Control, Event, Fix, Scan, short_text
+from kalmark.logs.source import spelling_hint
 
 LONGEST_LINE = 10_000_000  # characters: more than any scan has
 _TIMES = ("t_s", "t_ns", "robot")
@@ -26,30 +26,32 @@ def mapping_of(line: str) -> dict[str, Any]:
     try:
         given = json.loads(line, object_pairs_hook=_once)
     except RecursionError:
-        raise EventError(f"{shown(line)} is nested too deeply, expected an object of JSON") from None
+        raise EventError(f"{short_text(line)} is nested too deeply, expected an object of JSON") from None
     except ValueError as error:
         reason = " ".join(str(error).split())[:120]
-        raise EventError(f"{shown(line)} is no JSON ({reason}), expected an object on one line") from None
+        raise EventError(f"{short_text(line)} is no JSON ({reason}), expected an object on one line") from None
     if not isinstance(given, dict):
-        raise EventError(f"{shown(line)} is no object, expected one with a type, a time and a robot")
+        raise EventError(f"{short_text(line)} is no object, expected one with a type, a time and a robot")
     return given
 
 
-def event_of(given: dict[str, Any]) -> Event:
+def event_of_object(given: dict[str, Any]) -> Event:
     """Return the event that an object is.  Raises EventError."""
     kind = given.get("type")
     if not isinstance(kind, str) or kind not in KEYS:
-        hint = nearest(kind, KEYS) if isinstance(kind, str) else ""
-        raise EventError(f"type is {shown(kind)}, expected one of {', '.join(KEYS)}{hint}")
+        hint = spelling_hint(kind, KEYS) if isinstance(kind, str) else ""
+        raise EventError(f"type is {short_text(kind)}, expected one of {', '.join(KEYS)}{hint}")
     event, keys = KEYS[kind]
     told = {key: value for key, value in given.items() if key != "type"}
     for key in told:
         if key not in keys:
-            raise EventError(f"unknown key {shown(key)} of a {kind}, expected {', '.join(keys)}{nearest(key, keys)}")
+            raise EventError(
+                f"unknown key {short_text(key)} of a {kind}, expected {', '.join(keys)}{spelling_hint(key, keys)}"
+            )
     return event(**told)
 
 
-def line_of(event: Event) -> str:
+def line_of_event(event: Event) -> str:
     """Return an event as a line; times and numbers come back to the last bit.  Raises EventError for a frame."""
     kind = next((name for name, (cls, _) in KEYS.items() if type(event) is cls), None)
     if kind is None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, listed
+from kalmark.events import Control, Event, Id, Scan, list_names
 from kalmark.geometry.angles import wrap
 
 Times = Index
@@ -116,7 +116,7 @@ class PositionTrack:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Hold one log: `events` sorted by `kalmark.events.order`, and what is known to score them against.
+    """Hold one log: `events` sorted by `kalmark.events.sort_key`, and what is known to score them against.
 
     `truth` and `gps` are by robot, `landmarks` are by id: true positions (2,) or (3,) m, both ends of a line (6,) or
     the pose of a tag (7,) (all {} where unknown).  `skipped` has one line for each thing left out; `control_columns`
@@ -149,7 +149,7 @@ class Log:
     def __repr__(self) -> str:
         span = f" in {(self.events[-1].t_ns - self.events[0].t_ns) * 1e-9:.1f} s" if self.events else ""
         truth = ", with truth" if self.truth or self.landmarks else ""
-        return f"<Log {self.name!r} of {listed(self.robots)}: {len(self.events)} events{span}{truth}>"
+        return f"<Log {self.name!r} of {list_names(self.robots)}: {len(self.events)} events{span}{truth}>"
 
     def __iter__(self) -> Iterator[Event]:
         return iter(self.events)

@@ -11,16 +11,16 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Scan, order
+from kalmark.events import Control, Event, Fix, Frame, Scan, sort_key
 from kalmark.logs.log import Log
-from kalmark.logs.source import nearest, quantity
+from kalmark.logs.source import quantity, spelling_hint
 
 TIME = "t_s"
 
 Path_ = tuple[str, ...]
 
 
-def corrected(log: Log, factors: Mapping[str, Any] | None, shift_s: Mapping[str, Any] | None) -> Log:
+def correct_log(log: Log, factors: Mapping[str, Any] | None, shift_s: Mapping[str, Any] | None) -> Log:
     """Return a log with its columns times `factors` and the scans of its sensors `shift_s` seconds later.
 
     Both may be nested by robot and sensor: ``{range_m: .001}`` is for all sensors, ``{laser: {range_m: .001}}`` for
@@ -41,7 +41,7 @@ def corrected(log: Log, factors: Mapping[str, Any] | None, shift_s: Mapping[str,
     events = [_event(event, of, late, times) for event in log]
     truth = {robot: replace(path, t_ns=_scaled(path.t_ns, times)) for robot, path in log.truth.items()}
     gps = {robot: replace(path, t_ns=_scaled(path.t_ns, times)) for robot, path in log.gps.items()}
-    return replace(log, events=sorted(events, key=order), truth=truth, gps=gps)
+    return replace(log, events=sorted(events, key=sort_key), truth=truth, gps=gps)
 
 
 def _flat(values: Mapping[str, Any], option: str, path: Path_ = ()) -> Iterator[tuple[Path_, float]]:
@@ -59,7 +59,7 @@ def _refuse_idle(option: str, given: Mapping[Path_, float], known: list[Path_]) 
     for path in given:
         if not any(path[-1] in of[-1:] + (of if option == "shift_s" else ()) and {*path} <= {*of} for of in known):
             names = [*dict.fromkeys(of[-1] for of in known)]
-            wanted = f"{', '.join(names) or 'none'}{nearest(path[-1], names)}"
+            wanted = f"{', '.join(names) or 'none'}{spelling_hint(path[-1], names)}"
             told = f"{option}.{'.'.join(path)} is of nothing in this log"
             raise LogError(f"log option {told}, expected robots and sensors of the log and one of {wanted}")
 
@@ -70,7 +70,7 @@ def _product(factors: Mapping[Path_, float], path: Path_) -> float:
     return float(np.prod([1.0, *mine]))
 
 
-def at_time(event: Event, t_ns: int, y: Array | None = None, cov: Array | None = None) -> Event:
+def event_at_time(event: Event, t_ns: int, y: Array | None = None, cov: Array | None = None) -> Event:
     """Return an event at another time, and a scan with other measurements and noise, if these are given."""
     if not isinstance(event, Scan):
         return replace(event, t_ns=t_ns)
@@ -81,16 +81,16 @@ def at_time(event: Event, t_ns: int, y: Array | None = None, cov: Array | None =
 def _event(event: Event, factors: Mapping[Path_, Array], late: Mapping[Path_, float], times: float) -> Event:
     t_ns = event.t_ns if times == 1.0 else round(event.t_ns * times)
     if isinstance(event, Fix):
-        return at_time(event, t_ns)
+        return event_at_time(event, t_ns)
     path = (event.robot,) if isinstance(event, Control) else (event.robot, event.sensor)
     t_ns += round(late.get(path, 0.0) * 1e9)
     if isinstance(event, Frame):
-        return at_time(event, t_ns)
+        return event_at_time(event, t_ns)
     by = factors.get(path, np.ones(1))
     cov = None if event.cov is None else event.cov * np.outer(by, by)
     if isinstance(event, Control):
         return replace(event, t_ns=t_ns, u=event.u * by, cov=cov)
-    return at_time(event, t_ns, event.y * by if len(event.y) else None, cov)
+    return event_at_time(event, t_ns, event.y * by if len(event.y) else None, cov)
 
 
 def _scaled(t_ns: Any, times: float) -> Any:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from kalmark.errors import LogError
-from kalmark.events import shown
-from kalmark.logs.formats import requested, robot_names, selected
+from kalmark.events import short_text
+from kalmark.logs.formats import request_of, robot_names, select_events
 from kalmark.logs.log import Log
-from kalmark.logs.native import EVENTS, FILES, of_tables
+from kalmark.logs.native import EVENTS, FILES, log_of_tables
 from kalmark.logs.table import CSV, Content
 
 
@@ -41,9 +41,9 @@ def log_from(
     there = {file: sheet(file.removesuffix(CSV), table) for file, table in given.items() if table is not None}
     if not {*EVENTS} & there.keys():
         raise LogError("log_from: no controls, scans, fixes or measurements, expected at least one of them")
-    request = requested(robot_names(robots), on_error)
-    log = of_tables(there, request, name, None, dict(describes or {}))
-    return selected(log, request, from_s, to_s, ids)
+    request = request_of(robot_names(robots), on_error)
+    log = log_of_tables(there, request, name, None, dict(describes or {}))
+    return select_events(log, request, from_s, to_s, ids)
 
 
 def sheet(name: str, table: Any) -> Content:
@@ -51,7 +51,7 @@ def sheet(name: str, table: Any) -> Content:
     table = table.to_pydict() if hasattr(table, "to_pydict") else table  # pyarrow
     names = list(table) if isinstance(table, Mapping) else list(getattr(table, "columns", ()))
     if not names or not all(isinstance(each, str) for each in names):
-        told = f"columns {shown(names)}" if names else f"a {type(table).__name__}"
+        told = f"columns {short_text(names)}" if names else f"a {type(table).__name__}"
         raise LogError(f"{name}: got {told}, expected a frame or a mapping with named columns")
     columns = {each: values(table[each]) for each in names}
     many = max((len(column) for column in columns.values() if isinstance(column, list)), default=1)

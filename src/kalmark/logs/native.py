@@ -37,11 +37,11 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import classes, is_own
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, in_order, order, shown
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, short_text, sort_events, sort_key
 from kalmark.logs.geodesy import Globe, origin_of
 from kalmark.logs.image_files import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.source import Format, Request, folder_of, mapping, nearest, seconds
+from kalmark.logs.source import Format, Request, folder_of, read_mapping, seconds_text, spelling_hint
 from kalmark.logs.table import PARQUET, Content, Refused, Row, read_table
 from kalmark.logs.table_columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
 
@@ -79,7 +79,7 @@ def read(
         if near:
             raise LogError(f"{path / near[0]}: a file of this name is not read, expected {name}")
     describes = read_rig(path / RIG) if (path / RIG).is_file() else {}
-    return of_tables(there, request, path.name, path, describes, Globe(origin_of(origin, "log option origin")))
+    return log_of_tables(there, request, path.name, path, describes, Globe(origin_of(origin, "log option origin")))
 
 
 def tables(path: Path) -> dict[str, Path]:
@@ -97,7 +97,7 @@ def tables(path: Path) -> dict[str, Path]:
     return found
 
 
-def of_tables(
+def log_of_tables(
     there: Mapping[str, Path | Content], request: Request, called: str, path: Path | None, describes: dict[str, Any],
     globe: Globe | None = None,
 ) -> Log:  # fmt: skip
@@ -108,12 +108,12 @@ def of_tables(
             reader.events += read_file(there[name]) or ()
     seen = {name for event in reader.events if isinstance(event, Scan) for name in event.ids or ()}
     known = {*reader.truth, *describes.get("robots", ()), *map(str, seen)}
-    strays = refuse_misspelt(reader.places, known, request)
+    strays = refuse_misspelt_robots(reader.places, known, request)
     events = [event for event in reader.events if event.robot not in strays] if strays else reader.events
     columns = {key: names for key, names in reader.columns.items() if key[0] not in strays}
     return Log(
         name=called, path=path, robots=tuple(dict.fromkeys(event.robot for event in events)),
-        events=in_order(events), truth=reader.truth, landmarks=reader.landmarks, gps=reader.gps,
+        events=sort_events(events), truth=reader.truth, landmarks=reader.landmarks, gps=reader.gps,
         skipped=request.skipped, describes=describes,
         control_columns={robot: names for (robot, sensor), names in columns.items() if not sensor},
         sensor_columns={key: names for key, names in columns.items() if key[1]},
@@ -124,13 +124,13 @@ def of_tables(
 
 def read_rig(path: Path) -> dict[str, Any]:
     """Return what `rig.yaml` describes.  Raises LogError if it is no mapping with a mapping of robots."""
-    content = mapping(path)
+    content = read_mapping(path)
     robots = content.get("robots", {})
     if not isinstance(robots, dict):
-        raise LogError(f"{path}: robots: got {shown(robots)}, expected a mapping of keys")
+        raise LogError(f"{path}: robots: got {short_text(robots)}, expected a mapping of keys")
     for name, robot in robots.items():
         if not isinstance(robot, dict):
-            raise LogError(f"{path}: robots.{name}: got {shown(robot)}, expected a mapping of keys")
+            raise LogError(f"{path}: robots.{name}: got {short_text(robot)}, expected a mapping of keys")
     return content
 
 
@@ -284,7 +284,7 @@ class _Reader:
         table = read_table(path, ("t_s", "robot"), known=(*POSE2, *POSE3), globe=self.globe)
         if set(table.value_columns) not in (set(POSE2), set(POSE3)):
             odd = next((name for name in table.value_columns if name not in (*POSE2, *POSE3)), None)
-            hint = nearest(odd, (*POSE2, *POSE3)) if odd else ""
+            hint = spelling_hint(odd, (*POSE2, *POSE3)) if odd else ""
             given = ", ".join(table.value_columns) or "of a pose: none"
             wanted = f"either {', '.join(POSE2)} or {', '.join(POSE3)}"
             raise LogError(f"{path}:1: columns {given}, expected {wanted}{hint}")
@@ -351,7 +351,7 @@ def stream(path: Path, request: Request) -> Iterator[Event]:
         for name, read_file in zip(FILES, reader.readers, strict=True)
         if name in there and name in EVENTS
     ]
-    return merge(*files, key=order)
+    return merge(*files, key=sort_key)
 
 
 def _by_time(path: Path, events: Iterator[Event]) -> Iterator[Event]:
@@ -359,13 +359,13 @@ def _by_time(path: Path, events: Iterator[Event]) -> Iterator[Event]:
     last_ns = None
     for t_ns, same in groupby(events, key=lambda event: event.t_ns):
         if last_ns is not None and t_ns < last_ns:
-            told = f"an event at {seconds(t_ns)} s after one at {seconds(last_ns)} s"
+            told = f"an event at {seconds_text(t_ns)} s after one at {seconds_text(last_ns)} s"
             raise LogError(f"{path}: {told}, expected rows in the order of time: only these can be read one by one")
         last_ns = t_ns
-        yield from sorted(same, key=order)
+        yield from sorted(same, key=sort_key)
 
 
-def refuse_misspelt(places: Places, known: Collection[str], request: Request) -> set[str]:
+def refuse_misspelt_robots(places: Places, known: Collection[str], request: Request) -> set[str]:
     """Refuse the robots whose name seems misspelt, with file and line, and return them.
 
     Or that have nothing in common with the others: scans without controls, where another robot has controls.  Not those

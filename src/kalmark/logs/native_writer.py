@@ -17,7 +17,7 @@ from kalmark.files import replace_folder
 from kalmark.logs.image_files import write_depth, write_image
 from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, RIG
-from kalmark.logs.source import landmark_id, nanoseconds, seconds
+from kalmark.logs.source import landmark_id, nanoseconds_of_text, seconds_text
 from kalmark.logs.table import PARQUET, cov_columns
 from kalmark.logs.table_columns import CANONICAL, GPS, POSE2, POSE3, POSITION
 
@@ -37,8 +37,16 @@ def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path
     """
     folder = Path(folder)
     own = [*FILES, RIG, *(str(Path(name).with_suffix(PARQUET)) for name in FILES)]
-    tables = (controls(log), scans(log), fixes(log), truth(log), landmarks(log), gps(log), EMPTY)
-    replace_folder(folder, lambda made: _fill(made, log, (*tables, frames(log, made)), parquet), own, FILES[0])
+    tables = (
+        controls_table(log),
+        scans_table(log),
+        fixes_table(log),
+        truth(log),
+        landmarks_table(log),
+        gps(log),
+        EMPTY,
+    )
+    replace_folder(folder, lambda made: _fill(made, log, (*tables, frames_table(log, made)), parquet), own, FILES[0])
     return folder
 
 
@@ -67,40 +75,46 @@ def write_parquet(path: Path, header: list[str], rows: list[dict[str, str]]) -> 
     for name in header:
         told = [row.get(name) or None for row in rows]
         if name == "t_s":
-            columns["t_ns"] = [nanoseconds(text) if text else None for text in told]
+            columns["t_ns"] = [nanoseconds_of_text(text) if text else None for text in told]
         else:
             texts = name in ("robot", "sensor", "id")
             columns[name] = told if texts else [None if text is None else float(text) for text in told]
     pyarrow.parquet.write_table(pyarrow.table(columns), path)
 
 
-def controls(log: Log) -> Table:
+def controls_table(log: Log) -> Table:
     """Return header and rows of controls.csv."""
     events = [event for event in log if isinstance(event, Control)]
-    columns = union(checked(log.control_columns, c.robot, len(c.u)) for c in events)
+    columns = union(check_columns(log.control_columns, c.robot, len(c.u)) for c in events)
     if part := next((c for c in events if c.share < 1), None):
-        raise LogError(f"the control at {seconds(part.t_ns)} s is a part, expected whole increments: those 'recorded'")
+        raise LogError(
+            f"the control at {seconds_text(part.t_ns)} s is a part, expected whole increments: those 'recorded'"
+        )
     noise = cov_columns(max((len(c.cov) for c in events if c.cov is not None), default=0))
     rows = [
-        start(c) | cells(columns, log.control_columns[c.robot], c.u) | upper(c.cov, f"control at {c.t_s} s")
+        time_and_robot(c)
+        | cells(columns, log.control_columns[c.robot], c.u)
+        | upper_triangle(c.cov, f"control at {c.t_s} s")
         for c in events
     ]
     return ["t_s", "robot", *columns, *noise], rows
 
 
-def scans(log: Log) -> Table:
+def scans_table(log: Log) -> Table:
     """Return header and rows of scans.csv."""
     events = [event for event in log if isinstance(event, Scan)]
-    columns = union(checked(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in events if len(s.y))
+    columns = union(check_columns(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in events if len(s.y))
     noise = cov_columns(max((s.y.shape[1] for s in events if s.cov is not None), default=0))
     rows: list[dict[str, str]] = []
     seen: set[tuple[int, str, str]] = set()
     for s in events:
         key = (s.t_ns, s.robot, s.sensor)
         if key in seen:
-            raise LogError(f"two scans of {s.robot!r} by {s.sensor!r} at t={seconds(s.t_ns)} s, expected one at a time")
+            raise LogError(
+                f"two scans of {s.robot!r} by {s.sensor!r} at t={seconds_text(s.t_ns)} s, expected one at a time"
+            )
         seen.add(key)
-        begin = start(s) | {"sensor": name(s.sensor)}
+        begin = time_and_robot(s) | {"sensor": name(s.sensor)}
         if len(s.y) == 0:
             rows.append(begin)
             continue
@@ -108,17 +122,17 @@ def scans(log: Log) -> Table:
         covs = [None] * len(s.y) if s.cov is None else np.broadcast_to(s.cov, (len(s.y), size, size))
         for y, id_, cov in zip(s.y, s.ids or [None] * len(s.y), covs, strict=True):
             told = {} if id_ is None else {"id": id_text(id_)}
-            rows.append(begin | told | cells(columns, used, y) | upper(cov, f"scan at {s.t_s} s"))
+            rows.append(begin | told | cells(columns, used, y) | upper_triangle(cov, f"scan at {s.t_s} s"))
     return ["t_s", "robot", "sensor", "id", *columns, *noise], rows
 
 
-def frames(log: Log, folder: Path) -> Table:
+def frames_table(log: Log, folder: Path) -> Table:
     """Return header and rows of frames.csv, and write the images below the folder: IMAGES/SENSOR/NANOSECONDS.png."""
     rows: list[dict[str, str]] = []
     for frame in log:
         if not isinstance(frame, Frame):
             continue
-        row = start(frame) | {"sensor": name(frame.sensor)}
+        row = time_and_robot(frame) | {"sensor": name(frame.sensor)}
         told = frame.pixels(), frame.depths(), frame.right_grey()
         for column, pixels, write in zip(PICTURES, told, (write_image, write_depth, write_image), strict=True):
             if pixels is None:
@@ -131,11 +145,14 @@ def frames(log: Log, folder: Path) -> Table:
     return ["t_s", "robot", "sensor", *(c for c in PICTURES if c == "image" or any(c in row for row in rows))], rows
 
 
-def fixes(log: Log) -> Table:
+def fixes_table(log: Log) -> Table:
     """Return header and rows of fixes.csv."""
     events = [event for event in log if isinstance(event, Fix)]
     size = max((len(f.y) for f in events), default=2)
-    rows = [start(f) | named(POSITION, f.y) | upper(f.cov, f"fix at {f.t_s} s", "xyz") for f in events]
+    rows = [
+        time_and_robot(f) | texts_of_columns(POSITION, f.y) | upper_triangle(f.cov, f"fix at {f.t_s} s", "xyz")
+        for f in events
+    ]
     return ["t_s", "robot", *POSITION[:size], *cov_columns(size, "xyz")], rows
 
 
@@ -146,13 +163,13 @@ def truth(log: Log) -> Table:
         raise LogError("truth holds poses in the plane and in space, expected one kind")
     columns = POSE3 if sizes == {7} else POSE2
     rows = [
-        {"t_s": seconds(int(t)), "robot": name(robot)} | named(columns, pose)
+        {"t_s": seconds_text(int(t)), "robot": name(robot)} | texts_of_columns(columns, pose)
         for robot, path in log.truth.items() for t, pose in zip(path.t_ns, path.poses, strict=True)
     ]  # fmt: skip
     return ["t_s", "robot", *columns], rows
 
 
-def landmarks(log: Log) -> Table:
+def landmarks_table(log: Log) -> Table:
     """Return header and rows of landmarks.csv."""
     of_size = {len(names): names for names in LANDMARKS}
     sizes = {len(values) for values in log.landmarks.values()}
@@ -166,18 +183,18 @@ def landmarks(log: Log) -> Table:
 def gps(log: Log) -> Table:
     """Return header and rows of gps.csv."""
     rows = [
-        {"t_s": seconds(int(t)), "robot": name(robot)} | named(GPS, [*xy, *track.antenna])
+        {"t_s": seconds_text(int(t)), "robot": name(robot)} | texts_of_columns(GPS, [*xy, *track.antenna])
         for robot, track in log.gps.items() for t, xy in zip(track.t_ns, track.xy, strict=True)
     ]  # fmt: skip
     return ["t_s", "robot", *GPS], rows
 
 
-def start(event: Event) -> dict[str, str]:
+def time_and_robot(event: Event) -> dict[str, str]:
     """Return the cells of an event's time and robot."""
-    return {"t_s": seconds(event.t_ns), "robot": name(event.robot)}
+    return {"t_s": seconds_text(event.t_ns), "robot": name(event.robot)}
 
 
-def checked(columns: dict[Any, tuple[str, ...]], key: Any, size: int) -> tuple[str, ...]:
+def check_columns(columns: dict[Any, tuple[str, ...]], key: Any, size: int) -> tuple[str, ...]:
     """Return the column names of a control or scan.  Raises LogError if the log does not name them."""
     names = columns.get(key)
     if names is None or len(names) != size:
@@ -196,21 +213,21 @@ def cells(columns: tuple[str, ...], used: tuple[str, ...], values: Array) -> dic
     """Return the cells of `values`, named by `used`, some of `columns`.  Raises LogError if their order is another."""
     if columns != used and tuple(column for column in columns if column in used) != used:
         raise LogError(f"columns {', '.join(used)} would be read back in another order, expected that of {columns}")
-    return named(used, values)
+    return texts_of_columns(used, values)
 
 
-def named(columns: Sequence[str], values: Any) -> dict[str, str]:
+def texts_of_columns(columns: Sequence[str], values: Any) -> dict[str, str]:
     """Return numbers by column, as the shortest text that reads back as the same float."""
     return {column: repr(float(value)) for column, value in zip(columns, values, strict=False)}
 
 
-def upper(cov: Array | None, what: str, axes: str = "0123456789") -> dict[str, str]:
+def upper_triangle(cov: Array | None, what: str, axes: str = "0123456789") -> dict[str, str]:
     """Return the cells of the upper triangle of a covariance, row by row.  Raises LogError if it is not symmetric."""
     if cov is None:
         return {}
     if not np.array_equal(cov, cov.T):
         raise LogError(f"{what}: covariance {cov.tolist()} is not symmetric, expected a symmetric one")
-    return named(cov_columns(len(cov), axes), cov[np.triu_indices(len(cov))])
+    return texts_of_columns(cov_columns(len(cov), axes), cov[np.triu_indices(len(cov))])
 
 
 def name(text: str) -> str:

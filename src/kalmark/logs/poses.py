@@ -25,12 +25,12 @@ from kalmark.logs.source import (
     Format,
     Request,
     frame,
-    is_number,
-    nanoseconds,
-    number,
+    is_number_text,
+    nanoseconds_of_text,
+    number_of_text,
     read_text,
-    rows,
-    seconds,
+    seconds_text,
+    text_rows,
     timed_rows,
 )
 from kalmark.logs.table_columns import POSE3
@@ -48,27 +48,27 @@ def find(path: Path, cells: int) -> Path | None:
         return None
     with path.open("rb") as stream:
         begin = stream.read(8192).decode("utf-8", "replace").splitlines()
-    told = [split(line) for line in begin if line.strip() and not line.lstrip().startswith("#")]
+    told = [split_cells(line) for line in begin if line.strip() and not line.lstrip().startswith("#")]
     if cells == TUM_CELLS and told[1:] and not any(map(is_float, told[0])):
         told = told[1:]
     return path if told and len(told[0]) == cells and all(map(is_float, told[0])) else None
 
 
-def split(line: str) -> list[str]:
+def split_cells(line: str) -> list[str]:
     """Return the cells of a line: between blanks, commas or semicolons."""
     return line.replace(",", " ").replace(";", " ").split()
 
 
 def is_float(text: str) -> bool:
     """Return whether a text is a number, NaN among them."""
-    return is_number(text) or text.lower().lstrip("+-") == "nan"
+    return is_number_text(text) or text.lower().lstrip("+-") == "nan"
 
 
-def plain(path: Path, request: Request) -> str:
+def plain_text(path: Path, request: Request) -> str:
     """Return the text of a file of TUM with blanks, seconds and the usual order, line by line.  Raises LogError."""
     out, order, gone, unit, begun = list[str](), [*range(TUM_CELLS)], 0, 0, False
     for text in read_text(path).split("\n"):
-        line, cells = text, split(text.replace("#", " "))
+        line, cells = text, split_cells(text.replace("#", " "))
         if not begun and (line.lstrip().startswith("#") or not any(map(is_float, cells))):
             order = order_in(cells) or order
             out.append("")
@@ -76,10 +76,10 @@ def plain(path: Path, request: Request) -> str:
         begun = begun or bool(cells)
         if len(cells) == TUM_CELLS and not line.lstrip().startswith("#"):
             cells = [cells[k] for k in order]
-            unmeasured = all(is_float(cell) and not is_number(cell) for cell in cells[1:4])
-            if not unit and is_number(cells[0]):
+            unmeasured = all(is_float(cell) and not is_number_text(cell) for cell in cells[1:4])
+            if not unit and is_number_text(cells[0]):
                 unit = next((n for n in (1, 10**3, 10**6, 10**9) if abs(float(cells[0])) < n * LATEST_S), 1)
-            if unit > 1 and is_number(cells[0]):
+            if unit > 1 and is_number_text(cells[0]):
                 cells[0] = f"{Decimal(cells[0]) / unit:f}"
             gone += unmeasured
             line = "" if unmeasured else " ".join(cells)
@@ -113,14 +113,14 @@ def read_path(path: Path, request: Request) -> Trajectory:
 def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
     """Yield times (ns), which increase, and poses (7,)."""
     last_ns = None
-    for line, t_ns, values in timed_rows(path, POSE3, request.refuse, plain(path, request)):
+    for line, t_ns, values in timed_rows(path, POSE3, request.refuse, plain_text(path, request)):
         try:
             q = unit_quaternion(np.array(values[3:]), ValueError)
         except ValueError as error:
             request.refuse(f"{path}:{line}: {error}")
             continue
         if t_ns == last_ns:
-            request.refuse(f"{path}:{line}: time {seconds(t_ns)} s twice, expected increasing times")
+            request.refuse(f"{path}:{line}: time {seconds_text(t_ns)} s twice, expected increasing times")
         else:
             last_ns = t_ns
             yield t_ns, np.append(values[:3], q)
@@ -128,13 +128,13 @@ def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
 
 def kitti_rows(path: Path, request: Request, t_ns: Times | None = None) -> Iterator[tuple[int, Array]]:
     """Yield times (ns), which increase, and poses (7,); the times t_ns (N,) are those in the file beside if absent."""
-    lines = list(rows(path))
+    lines = list(text_rows(path))
     t_ns = kitti_times(path) if t_ns is None else t_ns
     if len(t_ns) != len(lines):
         raise LogError(f"{path}: {len(lines)} poses and {len(t_ns)} times, expected as many")
     for k, (line, cells) in enumerate(lines):
         try:
-            M = np.array([number(cell) for cell in cells]).reshape(3, 4)
+            M = np.array([number_of_text(cell) for cell in cells]).reshape(3, 4)
         except ValueError:
             request.refuse(f"{path}:{line}: {len(cells)} cells, expected {KITTI_CELLS} finite numbers")
             continue
@@ -162,14 +162,14 @@ def kitti_times(path: Path) -> Times:
     out = []
     for line, text in enumerate(read_text(file).split("\n"), 1):
         try:
-            out += [nanoseconds(text.strip())] if text.strip() else []
+            out += [nanoseconds_of_text(text.strip())] if text.strip() else []
         except ValueError:
             raise LogError(f"{file}:{line}: {text.strip()!r}, expected a time in s") from None
     return np.array(out, dtype=np.int64)
 
 
 # ------------------------------------------------------------------ to text
-def in_space(poses: Array) -> Array:
+def poses_in_space(poses: Array) -> Array:
     """Return poses (N, 3) or (N, 7) as those of space (N, 7), at z = 0."""
     if poses.shape[1] == len(POSE3):
         return poses
@@ -180,8 +180,8 @@ def in_space(poses: Array) -> Array:
 def tum_text(t_ns: Times, poses: Array) -> str:
     """Return a path, poses (N, 3) or (N, 7), as TUM lines: t x y z qx qy qz qw."""
     lines = ["# t_s x_m y_m z_m qx qy qz qw"]
-    for t, (x, y, z, *q) in zip(t_ns.tolist(), in_space(poses).tolist(), strict=True):
-        lines.append(f"{seconds(t)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
+    for t, (x, y, z, *q) in zip(t_ns.tolist(), poses_in_space(poses).tolist(), strict=True):
+        lines.append(f"{seconds_text(t)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
     return "\n".join(lines) + "\n"
 
 
@@ -192,10 +192,10 @@ def write_path(out: Path, t_ns: Times, poses: Array) -> list[Path]:
         write(out, tum_text(t_ns, poses))
         return [out]
     lines = []
-    for pose in in_space(poses):
+    for pose in poses_in_space(poses):
         M = np.column_stack([matrix(np.ascontiguousarray(pose[3:])), pose[:3]])
         lines.append(" ".join(f"{value:.12g}" for value in M.ravel()))
-    write(times_beside(out), "".join(f"{seconds(int(t))}\n" for t in t_ns))
+    write(times_beside(out), "".join(f"{seconds_text(int(t))}\n" for t in t_ns))
     write(out, "\n".join(lines) + "\n")
     return [out, times_beside(out)]
 

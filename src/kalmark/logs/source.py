@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 from kalmark.arrays import Array
 from kalmark.declare import Parameter, options_of
 from kalmark.errors import LogError
-from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, order, shown
+from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, short_text, sort_key
 from kalmark.files import refuse_aliases
 from kalmark.geometry import rotations
 from kalmark.logs.log import Log
@@ -103,12 +103,13 @@ class Format:
         """Refuse options that it does not have, and values that are not as declared.  Raises LogError."""
         for name, value in given.items():
             if name not in self.options:
-                wanted = f"{', '.join(self.options) or 'none'}{nearest(name, self.options)}"
+                wanted = f"{', '.join(self.options) or 'none'}{spelling_hint(name, self.options)}"
                 raise LogError(f"log option {name!r} is unknown to {self.name}, expected {wanted}")
             option = self.options[name]
             if value is not option.default and (wanted := option.refused(value)):
                 raise LogError(
-                    f"log option {name} is {shown(value)}, expected {wanted}{nearest(str(value), option.words)}"
+                    f"log option {name} is {short_text(value)}, "
+                    f"expected {wanted}{spelling_hint(str(value), option.words)}"
                 )
 
 
@@ -118,7 +119,7 @@ def one_robot(
 ) -> Log:  # fmt: skip
     """Return the log of one robot: its events in any order, the columns of its controls (none: ()) and sensors."""
     return Log(
-        name=name or format, format=format, path=path, robots=(robot,), events=sorted(events, key=order),
+        name=name or format, format=format, path=path, robots=(robot,), events=sorted(events, key=sort_key),
         skipped=request.skipped, control_columns={robot: controls} if controls else {},
         sensor_columns={(robot, sensor): columns for sensor, columns in sensors.items()}, **rest,
     )  # fmt: skip
@@ -137,7 +138,7 @@ def folder_of(path: Path, names: Iterable[str]) -> Path | None:
     return folder if any((folder / name).is_file() for name in names) else None
 
 
-def nearest(word: str, words: Iterable[str]) -> str:
+def spelling_hint(word: str, words: Iterable[str]) -> str:
     """Return a hint at the word that was probably meant, or nothing."""
     close = get_close_matches(word, list(words), n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
@@ -146,7 +147,7 @@ def nearest(word: str, words: Iterable[str]) -> str:
 def choice(value: Any, name: str, allowed: tuple[str, ...]) -> str:
     """Return an option's value if it is one of those allowed.  Raises LogError."""
     if value not in allowed:
-        hint = nearest(str(value), allowed)
+        hint = spelling_hint(str(value), allowed)
         raise LogError(f"log option {name} is {value!r}, expected one of {', '.join(allowed)}{hint}")
     return str(value)
 
@@ -159,19 +160,19 @@ def quantity(value: Any, name: str, low: float = float("-inf")) -> float:
         number = float("nan")
     if isinstance(value, bool) or not low <= number < float("inf"):
         wanted = "a finite number" if low == float("-inf") else f"a finite number of at least {low:g}"
-        raise LogError(f"log option {name} is {shown(value)}, expected {wanted}")
+        raise LogError(f"log option {name} is {short_text(value)}, expected {wanted}")
     if abs(number) > MOST["m"]:
-        raise LogError(f"log option {name} is {shown(value)}, expected at most {MOST['m']:.0e}")
+        raise LogError(f"log option {name} is {short_text(value)}, expected at most {MOST['m']:.0e}")
     return number
 
 
 # ------------------------------------------------------------------ text, without losing a bit
-def raising(line: str) -> None:
+def raise_refusal(line: str) -> None:
     """Refuse a bad row by raising LogError."""
     raise LogError(line)
 
 
-def nanoseconds(text: str, unit_ns: int = 1_000_000_000) -> int:
+def nanoseconds_of_text(text: str, unit_ns: int = 1_000_000_000) -> int:
     """Return the time in `text`, in units of `unit_ns`, as the nearest integer nanoseconds, exactly, or ValueError."""
     if len(text) > _LONGEST_TIME:
         raise ValueError(text)
@@ -193,7 +194,7 @@ def nanoseconds(text: str, unit_ns: int = 1_000_000_000) -> int:
     return t_ns
 
 
-def seconds(t_ns: int) -> str:
+def seconds_text(t_ns: int) -> str:
     """Return integer nanoseconds as text in seconds, exactly, with nine decimals."""
     whole, fraction = divmod(abs(t_ns), 1_000_000_000)
     return f"{'-' if t_ns < 0 else ''}{whole}.{fraction:09d}"
@@ -202,11 +203,11 @@ def seconds(t_ns: int) -> str:
 def landmark_id(text: str) -> Id:
     """Return an id from a file: int if the text is an integer, otherwise the text; or ValueError if it is too long."""
     if len(text) > LONGEST_ID:
-        raise ValueError(f"{shown(text)} is an id of {len(text)} characters, expected at most {LONGEST_ID}")
+        raise ValueError(f"{short_text(text)} is an id of {len(text)} characters, expected at most {LONGEST_ID}")
     return int(text) if _INTEGER.fullmatch(text) else text
 
 
-def number(text: str, limit: float = MOST_OTHER**2) -> float:
+def number_of_text(text: str, limit: float = MOST_OTHER**2) -> float:
     """Return a finite number of at most `limit` (of a variance, as the widest), or ValueError."""
     value = float(text)
     if not math.isfinite(value) or abs(value) > limit or "_" in text:
@@ -214,10 +215,10 @@ def number(text: str, limit: float = MOST_OTHER**2) -> float:
     return value
 
 
-def is_number(text: str) -> bool:
+def is_number_text(text: str) -> bool:
     """Return whether a text is a finite number."""
     try:
-        number(text)
+        number_of_text(text)
     except ValueError:
         return False
     return True
@@ -236,7 +237,7 @@ def read_text(path: Path) -> str:
     return text
 
 
-def rows(path: Path, text: str | None = None) -> Iterator[tuple[int, list[str]]]:
+def text_rows(path: Path, text: str | None = None) -> Iterator[tuple[int, list[str]]]:
     """Yield (line number, cells) of white-space separated text, without blank lines and `#` comments."""
     text = read_text(path) if text is None else text
     for line, content in enumerate(text.split("\n"), start=1):
@@ -250,13 +251,13 @@ def read_points(
 ) -> dict[Id, Array]:
     """Return the positions by id in rows `id x y` of so many cells, or {} without the file."""
     points = {}
-    for line, cells in rows(path) if path.is_file() else ():
+    for line, cells in text_rows(path) if path.is_file() else ():
         try:
             if len(cells) not in sizes:
                 raise ValueError
-            points[id_of(cells[0])] = np.array([number(cell) for cell in cells[1:3]])
+            points[id_of(cells[0])] = np.array([number_of_text(cell) for cell in cells[1:3]])
         except ValueError:
-            refuse(f"{path}:{line}: {shown(' '.join(cells))}, expected {expected}")
+            refuse(f"{path}:{line}: {short_text(' '.join(cells))}, expected {expected}")
     return points
 
 
@@ -268,16 +269,16 @@ def timed_rows(
     Raises LogError if the file is missing, empty or has no row at all.
     """
     last_ns, last_text, count = -_T_MAX_NS, "", 0
-    for line, cells in rows(path, text):
+    for line, cells in text_rows(path, text):
         count += 1
         if len(cells) != len(names) + 1:
             columns = ", ".join(("t_s", *names))
             refuse(f"{path}:{line}: {len(cells)} numbers in the row, expected {len(names) + 1}: {columns}")
             continue
         try:
-            t_ns, values = nanoseconds(cells[0]), [number(cell) for cell in cells[1:]]
+            t_ns, values = nanoseconds_of_text(cells[0]), [number_of_text(cell) for cell in cells[1:]]
         except ValueError:
-            odd = next((n for n, cell in enumerate(cells) if not is_number(cell)), 0)
+            odd = next((n for n, cell in enumerate(cells) if not is_number_text(cell)), 0)
             refuse(f"{path}:{line}: {('t_s', *names)[odd]} is {cells[odd]!r}, expected a finite number")
             continue
         if t_ns < last_ns:
@@ -302,7 +303,7 @@ def vector_frame(position: Any, vector: Any) -> Array:
     return np.append(np.asarray(position, dtype=np.float64).reshape(3), turn)
 
 
-def mapping(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path) -> dict[str, Any]:
     """Return the content of a YAML file, OpenCV's among them.  Raises LogError if it is none."""
     text = _OPENCV_HEAD.sub("", read_text(path)).replace("!!opencv-matrix", "")
     try:

@@ -22,11 +22,11 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import MOST, Id, bound, most, shown, unit_quaternion
+from kalmark.events import MOST, Id, bound, largest_magnitude, short_text, unit_quaternion
 from kalmark.logs import geodesy
 from kalmark.logs.geodesy import Globe
 from kalmark.logs.progress import track
-from kalmark.logs.source import Request, landmark_id, nanoseconds, nearest, number, read_text
+from kalmark.logs.source import Request, landmark_id, nanoseconds_of_text, number_of_text, read_text, spelling_hint
 from kalmark.logs.table_columns import (
     CANONICAL,
     DIRECTIONS,
@@ -149,7 +149,7 @@ class Table:
                 raise LogError(f"{told}all {len(size)} numbers are within pi and reach it, expected {wanted}")
 
 
-def opened(source: Path | Content) -> Content:
+def open_source(source: Path | Content) -> Content:
     """Return what a source has.  Raises LogError if it is missing, empty or none of its kind."""
     if isinstance(source, Content):
         return source
@@ -238,12 +238,12 @@ def read_table(
     positions on a `globe` are taken for x_m, y_m and z_m, if one is given.  Raises LogError if the source is missing or
     empty, or has a header that does not fit.
     """
-    content = opened(source)
+    content = open_source(source)
     where, known = content.where, (*required, *(allowed or ()), *known)
-    header, given, unit_ns = in_units(content.header, known)
+    header, given, unit_ns = header_in_units(content.header, known)
     on_globe = globe is not None and any(name in header for name in ("lat_deg", "lon_deg"))
     if on_globe:
-        header = in_plane(where, header, given)
+        header = columns_in_plane(where, header, given)
     for name in header:
         refuse_unit(where, name, known)
     for name in required:
@@ -263,14 +263,14 @@ def read_table(
     values = [name for name in header if name not in NAMES and name not in noise]
     for name in values:
         if allowed is not None and name not in required and name not in allowed:
-            wanted = f"{', '.join((*required, *allowed))}{nearest(name, allowed)}"
+            wanted = f"{', '.join((*required, *allowed))}{spelling_hint(name, allowed)}"
             raise LogError(f"{where}: column {name!r} is unknown, expected {wanted}")
     values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
     index = {name: i for i, name in enumerate(header)}
     return Table(Path(str(source)), index, tuple(values), noise, content, given, unit_ns, globe if on_globe else None)
 
 
-def in_plane(where: str, header: list[str], given: dict[str, tuple[str, float]]) -> list[str]:
+def columns_in_plane(where: str, header: list[str], given: dict[str, tuple[str, float]]) -> list[str]:
     """Return a header with the columns of positions on the globe under their names in the tangent plane.
 
     Notes in `given` what they were called.  Raises LogError where one is missing, or positions are there in both ways.
@@ -285,7 +285,7 @@ def in_plane(where: str, header: list[str], given: dict[str, tuple[str, float]])
     return [GLOBE.get(name, name) for name in header]
 
 
-def in_units(header: list[str], known: tuple[str, ...]) -> tuple[list[str], dict[str, tuple[str, float]], int]:
+def header_in_units(header: list[str], known: tuple[str, ...]) -> tuple[list[str], dict[str, tuple[str, float]], int]:
     """Return a header in kalmark's units, the names of columns that had others with their factors, and that of times.
 
     Only names that are known, or their standard deviations, have units that are known.
@@ -317,7 +317,7 @@ def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
         raise LogError(f"{where}: column {name!r} is unknown, expected {closest}{f', in {measure}' if measure else ''}")
 
 
-def decimal(text: str) -> str:
+def decimal_point(text: str) -> str:
     """Return a number with a decimal comma with a point.  Raises ValueError if it has both, as of thousands."""
     if "," not in text:
         return text
@@ -358,10 +358,10 @@ class Row:
         """Read the column t_s exactly, the robot and, if asked, the sensor.  Raises Refused."""
         text, table = self.text("t_s"), self.table
         try:
-            self.t_ns = nanoseconds(decimal(text) if table.content.comma else text, table.unit_ns)
+            self.t_ns = nanoseconds_of_text(decimal_point(text) if table.content.comma else text, table.unit_ns)
         except ValueError:
             wanted = "a finite number of seconds, within 292 years of 0"
-            raise Refused(f"{table.name('t_s')} is {shown(text)}, expected {wanted}") from None
+            raise Refused(f"{table.name('t_s')} is {short_text(text)}, expected {wanted}") from None
         self.robot, self.sensor = intern(self.text("robot")), intern(self.text("sensor")) if with_sensor else ""
         if not self.robot or (with_sensor and not self.sensor):
             raise Refused(f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
@@ -380,9 +380,9 @@ class Row:
         """Return the finite number in a column, in kalmark's unit.  Raises ValueError."""
         cell, table = self.cells[self.table.index[column]], self.table
         if type(cell) is str:
-            value = number(decimal(cell) if table.content.comma else cell, math.inf)
+            value = number_of_text(decimal_point(cell) if table.content.comma else cell, math.inf)
         elif isinstance(cell, int | float) and not isinstance(cell, bool):
-            value = number(repr(cell), math.inf) if type(cell) is int else cell
+            value = number_of_text(repr(cell), math.inf) if type(cell) is int else cell
             if not math.isfinite(value):
                 raise ValueError(cell)
         else:
@@ -396,11 +396,11 @@ class Row:
             try:
                 values.append(self.number(column))
             except (ValueError, OverflowError):
-                raise Refused(f"{name(column)} is {shown(self.text(column))}, expected a finite number") from None
-            if abs(values[-1]) > (MOST["m"] ** 2 if column.startswith("cov_") else most(column)[0]):
+                raise Refused(f"{name(column)} is {short_text(self.text(column))}, expected a finite number") from None
+            if abs(values[-1]) > (MOST["m"] ** 2 if column.startswith("cov_") else largest_magnitude(column)[0]):
                 wanted = f"at most {MOST['m'] ** 2:.0e}" if column.startswith("cov_") else bound(column)
                 wanted += ": did the counter of the wheel run over (2^32 steps)?" if column in WHEELS else ""
-                raise Refused(f"{name(column)} is {shown(self.text(column))}, expected {wanted}")
+                raise Refused(f"{name(column)} is {short_text(self.text(column))}, expected {wanted}")
             if values[-1] < 0 and column in NOT_NEGATIVE:
                 raise Refused(f"{name(column)} is {self.text(column)}, expected a {NOT_NEGATIVE[column]} of at least 0")
             if column in DIRECTIONS:
@@ -416,7 +416,7 @@ class Row:
             return values
         for name in ("x_m", "y_m"):
             if name not in columns:
-                raise Refused(f"{self.table.name(name)} is {shown(self.text(name))}, expected a finite number")
+                raise Refused(f"{self.table.name(name)} is {short_text(self.text(name))}, expected a finite number")
         lla = [values[i] for i in at]
         if wrong := geodesy.fault(lla):
             raise Refused(wrong)
@@ -448,7 +448,7 @@ class Row:
         given = tuple(name for name in self.table.noise_columns if self.text(name))
         if not given:
             return None
-        cov = covariance(dict(zip(given, self.numbers(given), strict=True)), columns)
+        cov = covariance_of_cells(dict(zip(given, self.numbers(given), strict=True)), columns)
         lowest = float(np.linalg.eigvalsh(cov)[0])
         if lowest < -1e-12 * float(np.abs(cov).max()) or (definite and lowest <= 0):
             wanted = "positive definite" if definite else "positive semidefinite"
@@ -456,7 +456,7 @@ class Row:
         return cov
 
 
-def covariance(given: dict[str, float], columns: tuple[str, ...]) -> Array:
+def covariance_of_cells(given: dict[str, float], columns: tuple[str, ...]) -> Array:
     """Return the covariance that `sigma_<column>` or `cov_ij` numbers describe.  Raises Refused."""
     size = len(columns)
     sigmas = [f"sigma_{name}" for name in columns]

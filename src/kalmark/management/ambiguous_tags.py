@@ -70,7 +70,7 @@ def is_clear(scan: ScanContext, k: int) -> bool:
     return not np.isfinite(chi2[0, 0]) or bool(chi2[0, 1] - chi2[0, 0] >= TELLING)
 
 
-def approach(
+def correct_by_tag_poses(
     scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int], known: Array | None = None
 ) -> Update | None:  # fmt: skip
     """Return the correction by the poses of those tags of the observations `rows` that are far; None if none is.

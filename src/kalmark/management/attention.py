@@ -104,7 +104,7 @@ class Attention:
 EVERYTHING = Attention()
 
 
-def chosen(
+def select_observations(
     scan: ScanContext, attention: Attention, groups: Sequence[Group], decisions: Sequence[Decision]
 ) -> tuple[list[Group], list[int]]:
     """Return the groups of observations with those alone that correct the map, and the rows that are left out."""
@@ -119,7 +119,7 @@ def chosen(
     return [(model, [k for k in some if k not in out]) for model, some in groups], out
 
 
-def left_out(
+def reasons_against_start(
     scan: ScanContext, attention: Attention, starts: Collection[Answer], new: Sequence[int], known: Sequence[int],
     decisions: Sequence[Decision],
 ) -> dict[int, str]:  # fmt: skip

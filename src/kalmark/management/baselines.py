@@ -20,7 +20,7 @@ from kalmark.tracks.scan import ScanContext
 SHARE = 0.05  # of the way from its anchor that a mount may leave open
 
 
-def left_open(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:
+def rays_without_baseline(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:
     """Return which observations `rows` (K,), of the blocks `slots`, are of rays whose way t the mount leaves open.
 
     With C = P_tm P_mm^-1 P_mt, what the position m of the mount leaves open of t: that moves the ray by more than the

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.association.gated import assigned
+from kalmark.association.gated import assign
 from kalmark.association.posterior import WELL_KNOWN
 from kalmark.association.protocol import Association, new_gate
 from kalmark.association.query import log_volume_ratio
-from kalmark.association.wall_segments import apart
+from kalmark.association.wall_segments import disjoint_from_walls
 from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.map import Map
@@ -44,7 +44,7 @@ class Match(NamedTuple):
     d2: float
 
 
-def matched(
+def match_tentative(
     scan: ScanContext, association: Association, rows: list[int], lost: Flags
 ) -> tuple[list[Match], list[Observation]]:
     """Compare the observations `rows` with the tentative landmarks; return the pairs, and what is to be left alone.
@@ -59,7 +59,7 @@ def matched(
     gate = scan.channel.gate if np.isfinite(scan.channel.gate) else chi2_gate(0.99, scan.channel.dof)
     far = max(gate, chi2_gate(new_gate(association), scan.channel.dof))
     matches, others = [], []
-    for i, (k, column) in enumerate(zip(rows, assigned(d2, gate).tolist(), strict=True)):
+    for i, (k, column) in enumerate(zip(rows, assign(d2, gate).tolist(), strict=True)):
         least = int(np.argmin(d2[i]))
         if column >= 0:
             matches.append(Match(k, names[column], float(d2[i, column])))
@@ -71,7 +71,7 @@ def matched(
     return matches, others
 
 
-def in_view(scan: ScanContext, names: Sequence[Id]) -> list[Id]:
+def tentative_in_view(scan: ScanContext, names: Sequence[Id]) -> list[Id]:
     """Return which of the tentative landmarks the sensor should observe; all if its model has no field of view."""
     if not isinstance(scan.channel.sensor, Visible):
         return list(names)
@@ -84,7 +84,7 @@ def in_view(scan: ScanContext, names: Sequence[Id]) -> list[Id]:
     return found
 
 
-def residual(
+def measurement_difference(
     map_: Map, estimator: Estimator, channel: Channel, clone: int, track: Track, m: Measurement
 ) -> tuple[Start, Array]:
     """Return e - y of a measurement as a block, to be observed as zero with the noise R (p, p); and R.
@@ -120,7 +120,9 @@ def _distances(scan: ScanContext, rows: Sequence[int], names: Sequence[Id], lost
             slots, model = np.array([tracks[n].slot for n in j.tolist()]), scan.channel.models[kind]
             Z, d2[i, j], R = scan.predict(model, slots, np.asarray(rows)[i])
             if scan.channel.joins:
-                others = apart(scan, model.landmark, [tracks[n] for n in j.tolist()], np.asarray(rows)[i], d2[i, j])
+                others = disjoint_from_walls(
+                    scan, model.landmark, [tracks[n] for n in j.tolist()], np.asarray(rows)[i], d2[i, j]
+                )
                 d2[i, j] = np.where(others, np.inf, d2[i, j])
             d2[i, j] = np.where(lost[i] & (log_volume_ratio(Z, R) > WELL_KNOWN), np.inf, d2[i, j])
     d2[np.isnan(d2)] = np.inf

@@ -25,7 +25,7 @@ from kalmark.arrays import Array
 from kalmark.declare import Count, Positive, Within, register
 from kalmark.events import Id
 from kalmark.geometry.frames import compose
-from kalmark.geometry.gaussian import between, bhattacharyya, gate, merge
+from kalmark.geometry.gaussian import bhattacharyya, gate, merge, relative_frame
 from kalmark.models.observe import linearize
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.scan import ScanContext, Start
@@ -66,7 +66,7 @@ def has_moved(scan: ScanContext, last: int | None, policy: Delayed) -> bool:
 
 
 # ---------------------------------------------------------------------- candidates
-def joined(
+def extend_candidates(
     scan: ScanContext, policy: Delayed, candidates: Candidates, new: Mapping[int, Measurement],
     names: Mapping[int, Id | None],
 ) -> tuple[Candidates, dict[int, Pending]]:  # fmt: skip
@@ -164,7 +164,7 @@ def _relative(scan: ScanContext, a: int, b: int) -> tuple[Array, Array]:
     """Return the pose of the sensor at clone b as seen from that at a, (3,), and its covariance (3, 3)."""
     slots = [scan.clones[a], scan.clones[b]]
     (S, S_a, _), (T, T_b, _) = (compose(scan.map.mean(slot), _mount(scan)) for slot in slots)
-    c, C_S, C_T = between(S, T)
+    c, C_S, C_T = relative_frame(S, T)
     J = np.hstack([C_S @ S_a, C_T @ T_b])
     return c, J @ scan.map.covariance(slots) @ J.T
 
@@ -208,12 +208,12 @@ class Solution(NamedTuple):
         return Start(scan.channel.landmark.space, self.p, parts, self.G, self.Q)
 
 
-def started(scan: ScanContext, policy: Delayed, candidates: Candidates, c: Pending) -> Outcome:
+def start_landmark(scan: ScanContext, policy: Delayed, candidates: Candidates, c: Pending) -> Outcome:
     """Return the landmark that a candidate starts, or why not yet."""
     merged = len(c.measurements) - 1
     if merged < policy.persistence:
         return Outcome(candidates, f"{merged} of {policy.persistence} intersections agree")
-    found = solved(scan, c)
+    found = solve_candidate(scan, c)
     if not found.chi2 <= gate(FITS, found.dof):
         left = [other for other in candidates if other is not c]
         return Outcome(left, f"its {merged + 1} measurements do not agree: chi-square {found.chi2:.1f} of {found.dof}")
@@ -226,7 +226,7 @@ def started(scan: ScanContext, policy: Delayed, candidates: Candidates, c: Pendi
     return Outcome(candidates, f"{merged} intersections agree", found.start(scan), filled)
 
 
-def unexplained(scan: ScanContext, candidates: Candidates, used: Pending, slot: int) -> Candidates:
+def drop_explained(scan: ScanContext, candidates: Candidates, used: Pending, slot: int) -> Candidates:
     """Return the candidates without the measurements that a new landmark on a slot explains."""
     model = scan.channel.models[scan.channel.landmark.kind]
     gone = {(m.clone, m.k) for m in used.measurements}
@@ -242,7 +242,7 @@ def unexplained(scan: ScanContext, candidates: Candidates, used: Pending, slot: 
     ]  # fmt: skip
 
 
-def solved(scan: ScanContext, c: Pending) -> Solution:
+def solve_candidate(scan: ScanContext, c: Pending) -> Solution:
     """Return the point that fits all measurements of a candidate best.
 
     Least squares weighted by S = H P H' + R, P of the poses: with W = (E' S^-1 E)^-1 E' S^-1 the point errs by
@@ -298,7 +298,7 @@ def _filled(
         off = [_linearized(scan, Pending(scan.key, c.name, (m,)), found.p, size)[0] for m in here]
         for i in np.argsort([np.linalg.norm(z) for z in off])[:1].tolist():
             more = replace(c, measurements=tuple(sorted([*c.measurements, here[i]], key=lambda m: m.clone)))
-            better = solved(scan, more)
+            better = solve_candidate(scan, more)
             if better.chi2 - found.chi2 <= gate(FITS, len(here[i].y)):
                 c, found, gap = more, better, 0
         longest = max(longest, gap)

@@ -60,7 +60,7 @@ def concerns(scan: ScanContext, upkeep: Upkeep) -> bool:
     return hidden and scan.channel.has_limits
 
 
-def look(scan: ScanContext, upkeep: Upkeep) -> list[Track]:
+def count_misses(scan: ScanContext, upkeep: Upkeep) -> list[Track]:
     """Count what a scan saw of what was expected; return the landmarks that it missed."""
     tracks, pose = scan.tracks, scan.pose()
     looks, stated = tracks.looks.setdefault(scan.key, Looks()), upkeep.p_detect is not None
@@ -78,7 +78,7 @@ def look(scan: ScanContext, upkeep: Upkeep) -> list[Track]:
         return []
     begun = {o.landmark for o in made if o.outcome == "new"} if fused < len(made) else set()
     far, missed = looks.scale_m, list[Track]()
-    for model, near in _around(scan):
+    for model, near in _nearest_landmarks(scan):
         names = [name for name in near if name not in begun] if begun else near
         v = model.landmark.seen_from(pose, scan.map.means(tracks.slots_of(names), model.d))[0]
         sure = _surely(scan.channel, v)
@@ -102,7 +102,7 @@ def look(scan: ScanContext, upkeep: Upkeep) -> list[Track]:
     return missed
 
 
-def gone(tracks: Tracks, upkeep: Upkeep, missed: Sequence[Track]) -> list[Track]:
+def absent_landmarks(tracks: Tracks, upkeep: Upkeep, missed: Sequence[Track]) -> list[Track]:
     """Return those of the `missed` landmarks that are gone, or never were there."""
     if not upkeep.removes:
         return []
@@ -162,12 +162,12 @@ def _false(upkeep: Upkeep) -> Detection:
     return Detection(worth * upkeep.p_false, worth * (1.0 - upkeep.p_false))
 
 
-def unseen(odds: Mapping[Id, float], upkeep: Upkeep) -> frozenset[Id]:
+def unseen_landmarks(odds: Mapping[Id, float], upkeep: Upkeep) -> frozenset[Id]:
     """Return the landmarks with such log odds that are not seen again where they should be."""
     return frozenset(name for name, value in odds.items() if value <= -math.log(upkeep.odds))
 
 
-def of_map(tracks: Tracks, upkeep: Upkeep) -> dict[Id, float]:
+def log_odds_of_map(tracks: Tracks, upkeep: Upkeep) -> dict[Id, float]:
     """Return the log odds of the landmarks of a map that were looked at since they began."""
     mapped = [*tracks.confirmed.values()]
     judged = [track for track in mapped if track.seen or track.missed > 0.0]
@@ -181,7 +181,7 @@ def _counts(tracks: Sequence[Track]) -> tuple[Array, Array, Array]:
     return found[:, 0], found[:, 1], found[:, 2]
 
 
-def _around(scan: ScanContext) -> list[tuple[ObservationModel, list[Id]]]:
+def _nearest_landmarks(scan: ScanContext) -> list[tuple[ObservationModel, list[Id]]]:
     """Return the landmarks nearest to the sensor, those of one kind together, that are points."""
     tracks, channel = scan.tracks, scan.channel
     if channel.gives_places:

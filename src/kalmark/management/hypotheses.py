@@ -40,7 +40,7 @@ def to_point(l: Array) -> tuple[Array, Array]:
     return l[:2] + l[3] * u, np.array([[1.0, 0.0, -l[3] * u[1], u[0]], [0.0, 1.0, l[3] * u[0], u[1]]])
 
 
-def weights(log_weights: Array) -> Array:
+def normalized_weights(log_weights: Array) -> Array:
     """Return the weights (H,), whose sum is 1, of their logarithms."""
     w = np.exp(log_weights - log_weights.max())
     return np.asarray(w / w.sum())
@@ -75,7 +75,7 @@ class Hypotheses:
         """Remove the unlikely hypotheses; start the landmark if one position is left of them."""
         if pending.used == 1:
             return Step("tentative", f"{self.count} hypotheses of its direction")
-        w = weights(np.array(pending.log_weights))
+        w = normalized_weights(np.array(pending.log_weights))
         keep = w > self.odds
         left = tuple(slot for slot, good in zip(pending.hypotheses, keep.tolist(), strict=True) if good)
         removed = tuple(slot for slot in pending.hypotheses if slot not in left)
@@ -149,7 +149,7 @@ def _point(scan: ScanContext, pending: Pending) -> Start | None:
 
     Mean and covariance are those of the mixture, and the bulge of the arcs is added.
     """
-    map_, w, slots = scan.map, weights(np.array(pending.log_weights)), pending.hypotheses
+    map_, w, slots = scan.map, normalized_weights(np.array(pending.log_weights)), pending.hypotheses
     means, covs = [map_.mean(slot) for slot in slots], [map_.covariance([slot]) for slot in slots]
     points = [to_point(l) for l in means]
     p = np.asarray(sum(a * q for a, (q, _) in zip(w, points, strict=True)))

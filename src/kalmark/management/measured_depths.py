@@ -62,7 +62,9 @@ class Inverse:
         return np.zeros((len(y), 1, 1))
 
 
-def approach(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Update | None:
+def correct_by_inverse_ranges(
+    scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]
+) -> Update | None:
     """Return the correction by the inverse ranges of the observations `rows` that are far; None if none is.
 
     `slots` (K,) are the blocks of their landmarks.

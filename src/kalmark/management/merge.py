@@ -143,7 +143,7 @@ def difference(map_: Map, tracks: Tracks, pair: Pair) -> Start:
     return Start(Space("difference", space.kinds), l, ((one, n), (other, n)), G, np.zeros((n, n)))
 
 
-def order(tracks: Tracks, pairs: Sequence[Pair]) -> list[Pair]:
+def order_pairs(tracks: Tracks, pairs: Sequence[Pair]) -> list[Pair]:
     """Return of each pair the landmark that stays and the one that goes: an id of the log stays, else the older one."""
     age = {name: i for i, name in enumerate(tracks.confirmed)}
     sorted_ = [sorted(pair, key=lambda name: (tracks.is_invented(name), age[name])) for pair in pairs]

@@ -10,7 +10,7 @@ from kalmark.arrays import Array
 from kalmark.geometry.frames3d import to_frame_many
 from kalmark.models.cameras import project_pinhole
 from kalmark.models.landmarks import Point2D, Point3D, PointHeight2D
-from kalmark.models.lines import crossing_angles, extended
+from kalmark.models.lines import crossing_angles, extend_segments
 from kalmark.models.protocols import Landmark, Reparametrizable, Segmented, UnknownDepth
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Track
@@ -33,7 +33,7 @@ class Simplified(NamedTuple):
     start: Start
 
 
-def surveyed(model: Landmark, mean: Any) -> Landmark:
+def surveyed_type(model: Landmark, mean: Any) -> Landmark:
     """Return the type of a landmark known beforehand: a point, also where a sensor would start one of unknown depth.
 
     In the plane one with three numbers has a height.
@@ -45,7 +45,7 @@ def surveyed(model: Landmark, mean: Any) -> Landmark:
     return Point2D() if model.space.world == "plane" else Point3D()
 
 
-def simplified(scan: ScanContext, track: Track, threshold: float) -> Simplified | None:
+def point_if_linear(scan: ScanContext, track: Track, threshold: float) -> Simplified | None:
     """Return the point that a landmark becomes if its linearity index is below the threshold: P_pp = P_l P_ll P_l'."""
     model, map_ = track.model, scan.map
     if not isinstance(model, Reparametrizable):
@@ -69,8 +69,8 @@ def extent(scan: ScanContext, track: Track, y: Array) -> Array:
     measured = line.abscissas(T, l, rays)
     if isinstance(line, _PriorDirection):
         worst = np.array([max(_sigma_px(sensor, T, p[0, i], P_l[0, i] @ P @ P_l[0, i].T) for i in range(2))])
-        return extended(ends, measured, sigma_px=worst, switch_px=line.switch_px)[0]
-    return extended(ends, measured, angles=crossing_angles(T, p, rays))[0]
+        return extend_segments(ends, measured, sigma_px=worst, switch_px=line.switch_px)[0]
+    return extend_segments(ends, measured, angles=crossing_angles(T, p, rays))[0]
 
 
 def _sigma_px(sensor: Any, T: Array, p: Array, P: Array) -> float:

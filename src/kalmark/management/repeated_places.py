@@ -22,7 +22,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.association.ratio import log_ratios
-from kalmark.association.relocalization import aligned
+from kalmark.association.relocalization import align_points
 from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.geometry.angles import rotation
@@ -55,7 +55,7 @@ CLEAR = 0.2  # from a half, the share of the last scan's landmarks that decides 
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
 
 
-def repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
+def find_repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
     """Return the repeats in a map of points in the plane, the surest first.  O(n log n)."""
     look = _Look.of(map_, tracks)
     if look is None:
@@ -267,7 +267,7 @@ def _grown(look: _Look, T: Array, pairs: Index) -> _Constellation:
         if free.sum() < 3:
             break
         pairs = np.column_stack([a[free], b[free]])
-        T = aligned(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(len(pairs)))
+        T = align_points(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(len(pairs)))
         now = {*map(tuple, pairs.tolist())}
         if now == before:
             break
@@ -353,7 +353,7 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     pairs = found.pairs
     if np.median(pairs[:, 0]) > np.median(pairs[:, 1]):  # the order of landmarks is that of their age
         pairs = pairs[:, ::-1]
-    T = aligned(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(k))
+    T = align_points(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(k))
     score, fits, agrees = _weighed(look, T, pairs, density)
     score += MISSED * found.missing
     rivals = any(

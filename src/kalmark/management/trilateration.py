@@ -22,7 +22,7 @@ from kalmark.declare import Probability, Within, register
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import POINT2
 from kalmark.management.pending import OTHERS, Step
-from kalmark.models.observe import composed
+from kalmark.models.observe import sensor_pose
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
@@ -160,7 +160,7 @@ def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> RangeProblem:
     S_x[:own, 3:first] = np.eye(own)
     for i, slot in enumerate(clones):
         r, mount, _ = channel.split(channel.observer(map_, slot))
-        T, T_r, T_s = composed(r, mount)
+        T, T_r, T_s = sensor_pose(r, mount)
         places[i], rows = T[:2], slice(own + 2 * i, own + 2 * i + 2)
         S_x[rows, first + 3 * i : first + 3 * i + 3] = scan.estimator.pose_jacobian(map_, slot, T_r[:2])
         if channel.mount >= 0:

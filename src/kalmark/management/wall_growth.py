@@ -29,7 +29,7 @@ TINY_M = 1e-9
 TURNED_RAD = 0.3  # walls at a larger angle are not compared: they meet in a corner
 
 
-def grown(scan: ScanContext, tracks: Sequence[Track], rows: Sequence[int]) -> list[Array | None]:
+def extend_extents(scan: ScanContext, tracks: Sequence[Track], rows: Sequence[int]) -> list[Array | None]:
     """Return the abscissas (2,) of what is known of some walls after the observations `rows` of them.
 
     None, of a surveyed wall, stands for its whole line.
@@ -55,7 +55,9 @@ def _hull(one: Array, other: Array) -> Array:
     return np.array([min(one[0], other[0]), max(one[1], other[1])])
 
 
-def agreeing(map_: Map, tracks: Tracks, channel: Channel, observed: Sequence[Id], odds: float) -> Merge | None:
+def find_coincident_wall(
+    map_: Map, tracks: Tracks, channel: Channel, observed: Sequence[Id], odds: float
+) -> Merge | None:
     """Return a wall of those observed with another one that is the same, and the log ratio of that; None at the end.
 
     Their segments join, and that their lines agree as they do is so many times likelier, `odds`, than by chance.
@@ -132,7 +134,7 @@ def _extent_on(map_: Map, wall: Track, other: Track) -> Array:
     return np.sort((ends - base[0]) @ (base[1] - base[0]))
 
 
-def united(map_: Map, kept: Track, gone: Track) -> Array:
+def united_extent(map_: Map, kept: Track, gone: Track) -> Array:
     """Return the abscissas (2,) of a wall that has taken in another one, on the line of the first."""
     assert kept.extent is not None
     return _hull(kept.extent, _extent_on(map_, kept, gone))

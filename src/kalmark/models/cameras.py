@@ -15,8 +15,8 @@ OMNI             `project_omni`, `back_project_omni`                            
 Intrinsics are k = (fx, fy, cx, cy) in pixels.  `limit` is the radius on the plane z = 1 (EQUIDISTANT: the angle theta)
 at which the distortion stops growing and the image would fold over.  Pixels and Jacobians are NaN where a lens shows
 nothing: beyond the limit, and behind the camera (z <= 0; an EQUIDISTANT lens images that too, up to its limit, and OMNI
-gives a pixel to every direction).  `parameters` makes `par`.  The correction c of a radial distortion has the same form
-as that.  TSAI (1987) has a polynomial that takes the distortion off, limited in r_d; DAVISON (MonoSLAM, 2007) and FOV
+gives a pixel to every direction).  `lens_parameters` makes `par`.  The correction c of a radial distortion has its
+form.  TSAI (1987) has a polynomial that takes the distortion off, limited in r_d; DAVISON (MonoSLAM, 2007) and FOV
 (Devernay and Faugeras, 2001) have one number.  OMNI is Scaramuzza's (2006): polynomials between the angle and the
 radius in the image, and an affine matrix of the pixels.  Nothing depends on the length of v, so that v may be the ray
 to a landmark of unknown depth.  [TB] `pinHole`, `invPinHole`, `omniCam`, `invOmniCam`.
@@ -43,7 +43,7 @@ HEAD = 6  # numbers before the coefficients
 ROUNDING = 1e-15
 
 
-def parameters(lens: str, k: Any, forward: Any = (), backward: Any = None, size: Any = None) -> Array:
+def lens_parameters(lens: str, k: Any, forward: Any = (), backward: Any = None, size: Any = None) -> Array:
     """Return `par` of a lens of `LENSES`.
 
     k: (fx, fy, cx, cy) or, omnidirectional, (cx, cy, c, d, e).  forward: the distortion (radtan: OpenCV's k1 k2 p1
@@ -68,7 +68,7 @@ def parameters(lens: str, k: Any, forward: Any = (), backward: Any = None, size:
         limit = min(valid_radius(d), math.pi)
     elif lens == "tsai":
         c = np.array([valid_radius(d)])
-        limit = float(grown(c[0], d)[0]) if np.isfinite(c[0]) else math.inf
+        limit = float(distortion_polynomial(c[0], d)[0]) if np.isfinite(c[0]) else math.inf
     else:
         limit = one_number_limit(lens, d)
     return np.concatenate([k, [limit, len(d)], d, c])
@@ -123,7 +123,7 @@ def back_project(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
     return back_project_pinhole(y, par[:4], par[n:])
 
 
-def in_view(lens: int, v: Array, par: Array, size: Array) -> Flags:
+def is_in_view(lens: int, v: Array, par: Array, size: Array) -> Flags:
     """Return which of v (K, 3) the lens shows at a pixel of the image (width, height), borders included.
 
     OMNI: where the ray back through the pixel is v's, within 2.6 degrees; elsewhere the polynomial has no meaning.
@@ -137,7 +137,7 @@ def in_view(lens: int, v: Array, par: Array, size: Array) -> Flags:
 
 
 @compiled
-def grown(r: float, d: Array) -> tuple[float, float]:
+def distortion_polynomial(r: float, d: Array) -> tuple[float, float]:
     """Return r_d = r (1 + d1 r^2 + d2 r^4 + ...) of d (n,), and its derivative."""
     scale, rate = 0.0, 0.0  # of the sum, in r^2
     for j in range(len(d) - 1, -1, -1):
@@ -149,14 +149,14 @@ def grown(r: float, d: Array) -> tuple[float, float]:
 
 
 @compiled
-def shrunk(rd: float, d: Array, limit: float) -> float:
-    """Return the r in [0, limit) with `grown(r, d)` = rd >= 0, d (n,), by bracketed Newton; NaN if there is none."""
+def invert_distortion(rd: float, d: Array, limit: float) -> float:
+    """Return the r in [0, limit) with r_d(r, d) = rd >= 0, d (n,), by bracketed Newton; NaN if there is none."""
     low, high = 0.0, min(limit, 100.0 + 2 * rd)
-    if grown(high, d)[0] <= rd:
+    if distortion_polynomial(high, d)[0] <= rd:
         return np.nan
     r = min(rd, 0.5 * high)
     for _ in range(100):
-        value, rate = grown(r, d)
+        value, rate = distortion_polynomial(r, d)
         if value > rd:
             high = r
         else:
@@ -198,7 +198,7 @@ def _back_project_radtan(y: Array, par: Array) -> tuple[Array, Array]:
     v, X_y = np.ones((len(y), 3)), np.empty((len(y), 2, 2))
     for i in range(len(y)):
         u0, u1 = (y[i, 0] - par[2]) / par[0], (y[i, 1] - par[3]) / par[1]
-        v[i, :2] = undistorted(u0, u1, par[HEAD : HEAD + 5], par[4])
+        v[i, :2] = undistort(u0, u1, par[HEAD : HEAD + 5], par[4])
         J = radtan_many(v[i : i + 1, :2], par[HEAD : HEAD + 5])[1][0]
         det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
         X_y[i, 0, 0], X_y[i, 0, 1] = J[1, 1] / (det * par[0]), -J[0, 1] / (det * par[1])
@@ -213,13 +213,13 @@ def _back_project_radtan(y: Array, par: Array) -> tuple[Array, Array]:
 
 
 @compiled
-def undistorted(u0: float, u1: float, d: Array, limit: float) -> Array:
+def undistort(u0: float, u1: float, d: Array, limit: float) -> Array:
     """Return the x (2,) that `radtan_many` carries to (u0, u1), NaN if there is none below the limit.
 
     Newton's method, from where the radial part alone comes from.
     """
     rd = math.hypot(u0, u1)
-    r = shrunk(rd, d[:3], limit)
+    r = invert_distortion(rd, d[:3], limit)
     scale = 1.0 if rd == 0.0 else (limit if math.isnan(r) else r) / rd
     x, size = np.array([[scale * u0, scale * u1]]), np.inf
     for _ in range(50):
@@ -245,7 +245,7 @@ def _project_equidistant(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
         x, y, z = v[i, 0], v[i, 1], v[i, 2]
         flat = math.hypot(x, y)
         r2 = flat * flat + z * z
-        radius, rate = grown(math.atan2(flat, z), d)
+        radius, rate = distortion_polynomial(math.atan2(flat, z), d)
         cos, sin, scale = (x / flat, y / flat, radius / flat) if flat > 0.0 else (1.0, 0.0, 1.0 / z)
         along, ahead = rate * z / r2, -rate * flat / r2  # d radius / d flat, / d z
         e[i, 0], e[i, 1] = k[2] + k[0] * radius * cos, k[3] + k[1] * radius * sin
@@ -263,10 +263,10 @@ def _back_project_equidistant(y: Array, par: Array) -> tuple[Array, Array]:
     for i in range(len(y)):
         p, q = (y[i, 0] - par[2]) / par[0], (y[i, 1] - par[3]) / par[1]
         radius = math.hypot(p, q)
-        theta = shrunk(radius, d, par[4])
+        theta = invert_distortion(radius, d, par[4])
         c, s = math.cos(theta), math.sin(theta)
         cos, sin, scale = (p / radius, q / radius, s / radius) if radius > 0.0 else (1.0, 0.0, 1.0)
-        rate = 1.0 / grown(theta, d)[1]
+        rate = 1.0 / distortion_polynomial(theta, d)[1]
         m[i, 0], m[i, 1], m[i, 2] = s * cos, s * sin, c
         M_y[i, 0, 0] = (rate * c * cos * cos + scale * sin * sin) / par[0]
         M_y[i, 1, 1] = (rate * c * sin * sin + scale * cos * cos) / par[1]
@@ -286,8 +286,8 @@ def distorted_radius(lens: int, r: float, par: Array) -> tuple[float, float]:
         t = 2.0 * math.tan(0.5 * d)
         return math.atan(t * r) / d, t / (d * (1.0 + t * t * r * r))
     n = HEAD + int(par[5])
-    rd = shrunk(r, par[HEAD:n], par[n])
-    return rd, 1.0 / grown(rd, par[HEAD:n])[1]
+    rd = invert_distortion(r, par[HEAD:n], par[n])
+    return rd, 1.0 / distortion_polynomial(rd, par[HEAD:n])[1]
 
 
 @compiled
@@ -301,7 +301,7 @@ def undistorted_radius(lens: int, rd: float, par: Array) -> tuple[float, float]:
         t, c = 2.0 * math.tan(0.5 * d), math.cos(rd * d)
         return (math.tan(rd * d) / t, d / (t * c * c)) if rd * d < 0.5 * math.pi else (np.nan, np.nan)
     n = HEAD + int(par[5])
-    return grown(rd, par[HEAD:n]) if rd < par[n] else (np.nan, np.nan)
+    return distortion_polynomial(rd, par[HEAD:n]) if rd < par[n] else (np.nan, np.nan)
 
 
 @compiled

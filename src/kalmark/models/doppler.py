@@ -26,7 +26,7 @@ NEAREST_M = 1e-3  # nearer than this a landmark has no direction
 
 
 @compiled
-def moving(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+def expect_range_rate(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Expect the range rate of v = (p, t) (K, 2 d), behind range and angles if y (K, m) has them; E_v (K, m, 2 d)."""
     k, d, m = len(v), v.shape[1] // 2, y.shape[1]
     e, E_v, p = np.empty((k, m)), np.zeros((k, m, 2 * d)), v[:, :d].copy()
@@ -63,7 +63,7 @@ class _Doppler(Expecting):
     world: ClassVar[str]
     columns: ClassVar[tuple[str, ...]] = ("range_rate_mps",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_rate_mps",)
-    expected: ClassVar[Any] = moving
+    expected: ClassVar[Any] = expect_range_rate
     additive: ClassVar[bool] = True
     sees_velocity: ClassVar[bool] = True
 

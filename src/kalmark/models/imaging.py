@@ -48,7 +48,7 @@ class _Camera(Spatial):
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, 3 or 4) appear in the image, borders included."""
         rays = np.ascontiguousarray(v[:, :3], dtype=np.float64)
-        return cameras.in_view(self.code, rays, np.array(self.parameters), np.array(self.image, dtype=np.float64))
+        return cameras.is_in_view(self.code, rays, np.array(self.parameters), np.array(self.image, dtype=np.float64))
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the viewing rays (K, 3), unit vectors, of pixels y (K, 2), and their Jacobian (K, 3, 2)."""
@@ -109,7 +109,7 @@ class _Lens(_PinHole):
     @cached_property
     def parameters(self) -> Array:
         """The numbers (n,) of the lens as `cameras.project` takes them."""
-        return cameras.parameters(self.lens, self.intrinsics, self.distortion, size=self.image)
+        return cameras.lens_parameters(self.lens, self.intrinsics, self.distortion, size=self.image)
 
 
 @register("sensor", "pinhole")
@@ -184,7 +184,7 @@ class Omnidirectional(_Camera):
     def parameters(self) -> Array:
         """The numbers (n,) of the lens as `cameras.project` takes them."""
         k = (self.cx_px, self.cy_px, self.c, self.d, self.e)
-        return cameras.parameters("omnidirectional", k, self.projection, self.back_projection)
+        return cameras.lens_parameters("omnidirectional", k, self.projection, self.back_projection)
 
 
 @register("sensor", "stereo")

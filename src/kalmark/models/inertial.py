@@ -239,7 +239,7 @@ class Rest(NamedTuple):
     cov: Array
 
 
-def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) -> Rest:
+def start_at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) -> Rest:
     """Return the start of a unit of which the first readings u (N, 6), at `t_s` (N,), are made at rest.
 
     `start` (size,) and `cov` (dof, dof) are what is known without them: position, heading and the prior of the biases
@@ -283,7 +283,7 @@ def at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Array) ->
     return Rest(until_s, state, P)
 
 
-def shaken(t_s: Array, u: Array) -> tuple[float, float]:
+def noise_densities(t_s: Array, u: Array) -> tuple[float, float]:
     """Return the densities of white noise, of rate [rad/s/sqrt(Hz)] and force [m/s^2/sqrt(Hz)], of readings u (N, 6).
 
     At `t_s` (N,).  A vehicle that shakes has more than the data sheet gives.  Of the spectrum above what a vehicle

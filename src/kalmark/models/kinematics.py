@@ -42,13 +42,13 @@ def arc(r: Array, v: float, w: float, dt: float) -> tuple[Array, Array, Array]:
 @compiled
 def screw(r: Array, v: Array, dt: float) -> tuple[Array, Array, Array]:
     """Move r (3,) for dt s by the constant velocity v (3,) = (vx, vy, w) in its own frame, exactly; R_v (3, 3)."""
-    step, S_v = screwed(v, dt)
+    step, S_v = velocity_step(v, dt)
     r2, R_r, R_d = compose(r, step)
     return r2, R_r, product(R_d, S_v)
 
 
 @compiled
-def screwed(v: Array, dt: float) -> tuple[Array, Array]:
+def velocity_step(v: Array, dt: float) -> tuple[Array, Array]:
     """Return the step (3,) of a velocity v (3,) that lasts dt s, in the robot's first frame, and S_v (3, 3)."""
     a = v[2] * dt
     p, q = exponential_v(a)
@@ -79,7 +79,7 @@ def still_to_come(v: Array, dt: float) -> tuple[Array, Array]:
 
     Both matrices (3, 3) are in the robot's frame, the step's where it happens, the results where the arc ends.
     """
-    step, S_v = screwed(v, dt)
+    step, S_v = velocity_step(v, dt)
     S_d, c, s = np.eye(3), math.cos(step[2]), math.sin(step[2])
     S_d[0, 2], S_d[1, 2] = -step[1], step[0]
     for S in (S_d, S_v):

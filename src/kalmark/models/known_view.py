@@ -46,7 +46,7 @@ def known_view(view: Any) -> Any:
 
 
 @compiled
-def split(y: Array, m: int) -> tuple[Array, Array]:
+def split_columns(y: Array, m: int) -> tuple[Array, Array]:
     """Return the first m columns of y (K, m + n) and the others."""
     k, size = y.shape
     measured, known = np.empty((k, m)), np.empty((k, size - m))
@@ -59,7 +59,7 @@ def split(y: Array, m: int) -> tuple[Array, Array]:
 
 
 @compiled
-def completed(e: Array, y: Array) -> Array:
+def append_columns(e: Array, y: Array) -> Array:
     """Return e (K, m) with the columns of y (K, m + n) behind the first m."""
     out = y.copy()
     for i in range(e.shape[0]):
@@ -71,22 +71,22 @@ def completed(e: Array, y: Array) -> Array:
 @compiled
 def linearize_known_in_plane(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """Return e (K, m + n), z (K, p), E_h (K, p, h) and E_l (K, p, 0) in the plane; y (K, m + n), l (K, 0)."""
-    measured, known = split(y, len(view[6]))
+    measured, known = split_columns(y, len(view[6]))
     e, z, E_h, _E_l = linearize_in_plane(view, head, known, measured)
-    return completed(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))
+    return append_columns(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))
 
 
 @compiled
 def linearize_known_in_space(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """Return e (K, m + n), z (K, p), E_h (K, p, h) and E_l (K, p, 0) in space; y (K, m + n), l (K, 0)."""
-    measured, known = split(y, len(view[6]))
+    measured, known = split_columns(y, len(view[6]))
     e, z, E_h, _E_l = linearize_in_space(view, head, known, measured)
-    return completed(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))
+    return append_columns(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))
 
 
 @compiled
 def linearize_known_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """Return e (K, m + n), z (K, p), E_h (K, p, h), E_l (K, p, 0) of a sensor with its own velocity; y (K, m + n)."""
-    measured, known = split(y, len(view[6]))
+    measured, known = split_columns(y, len(view[6]))
     e, z, E_h, _E_l = linearize_moving(view, head, known, measured)
-    return completed(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))
+    return append_columns(e, y), z, E_h, np.zeros((z.shape[0], z.shape[1], 0))

@@ -172,7 +172,7 @@ def tag_corners(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tu
 
 
 @compiled
-def raised(v: Array, height: float) -> Array:
+def raise_views(v: Array, height: float) -> Array:
     """Return views v (K, 2 or 3) in space (K, 3), from a sensor `height` m above the plane; in space that is 0.
 
     A landmark without a height is in the plane.
@@ -312,7 +312,7 @@ class Distancing(Expecting):
 
     def risen(self, v: Array) -> Array:
         """Return views v (K, 2 or 3) in space (K, 3), from the sensor's height."""
-        return np.asarray(raised(np.ascontiguousarray(v, dtype=np.float64), self.height))
+        return np.asarray(raise_views(np.ascontiguousarray(v, dtype=np.float64), self.height))
 
 
 @declared

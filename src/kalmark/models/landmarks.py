@@ -428,7 +428,7 @@ class _DepthsPrior(_Line):
     def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
         """Return the points (K, 2, 3) at abscissas t (K, 2), and P_l (K, 2, 3, n)."""
         shared = 3 * self.anchored
-        a, b = map(self.end.point, lines.ends(np.ascontiguousarray(l), shared))
+        a, b = map(self.end.point, lines.end_states(np.ascontiguousarray(l), shared))
         return lines.points_between(a, b, np.ascontiguousarray(t), shared)
 
 

@@ -58,7 +58,7 @@ def inverse_depth_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the rays v (K, 3) to inverse-depth points l (K, 6), V_T (K, 3, 6) and V_l (K, 3, 6)."""
     h, H_l = inverse_depth_to_anchored(l)
     v, V_T, V_h = anchored_seen_from(T, h)
-    return v, V_T, chained(V_h, H_l)
+    return v, V_T, multiply_many(V_h, H_l)
 
 
 @compiled
@@ -82,7 +82,7 @@ def homogeneous_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
 
 
 @compiled
-def chained(A: Array, B: Array) -> Array:
+def multiply_many(A: Array, B: Array) -> Array:
     """Return the products (K, a, c) of K matrices (K, a, b) and (K, b, c)."""
     C = np.zeros((len(A), A.shape[1], B.shape[2]))
     for i in range(len(A)):
@@ -140,7 +140,7 @@ def inverse_depth_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Ar
     """
     h, H_T, H_ray, H_rho = anchored_from_view(T, ray, rho)
     l, L_h = anchored_to_inverse_depth(h)
-    return l, chained(L_h, H_T), chained(L_h, H_ray), chained(L_h, H_rho)
+    return l, multiply_many(L_h, H_T), multiply_many(L_h, H_ray), multiply_many(L_h, H_rho)
 
 
 @compiled
@@ -207,7 +207,7 @@ def inverse_depth_to_point(l: Array) -> tuple[Array, Array]:
     """Return the Euclidean points p (K, 3) of inverse-depth points l (K, 6), and P_l (K, 3, 6)."""
     h, H_l = inverse_depth_to_anchored(l)
     p, P_h = anchored_to_point(h)
-    return p, chained(P_h, H_l)
+    return p, multiply_many(P_h, H_l)
 
 
 @compiled
@@ -268,4 +268,4 @@ def homogeneous_as_point(T: Array, l: Array) -> tuple[Array, Array, Array]:
 def through_point(T: Array, p: Array, P_l: Array) -> tuple[Array, Array, Array]:
     """Return points p (K, 3) in the frame T, v (K, 3), V_T (K, 3, 6) and V_l (K, 3, n), by their P_l (K, 3, n)."""
     v, V_T, V_p = to_frame_many(T, p)
-    return v, V_T, chained(V_p, P_l)
+    return v, V_T, multiply_many(V_p, P_l)

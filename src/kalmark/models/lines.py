@@ -34,7 +34,7 @@ from kalmark.compiled import compiled
 from kalmark.geometry.directions import unit_many
 from kalmark.geometry.frames3d import to_frame_many, turned_rates
 from kalmark.geometry.rotations import matrix, skew
-from kalmark.models.landmarks3d import anchored_seen_from, chained, homogeneous_seen_from, inverse_depth_seen_from
+from kalmark.models.landmarks3d import anchored_seen_from, homogeneous_seen_from, inverse_depth_seen_from, multiply_many
 
 PLUECKER_ABSCISSAS_M = (-8.0, 8.0)  # of a new line.  [TB]
 POINT_ABSCISSAS = (0.0, 1.0)
@@ -45,7 +45,7 @@ New = tuple[Array, Array, Array, Array]
 
 
 @compiled
-def crossed(a: Array, b: Array) -> tuple[Array, Array, Array]:
+def cross_products(a: Array, b: Array) -> tuple[Array, Array, Array]:
     """Return the cross products n = a x b of K pairs of vectors (K, 3), N_a (K, 3, 3) and N_b (K, 3, 3)."""
     n, N_a, N_b = np.empty((len(a), 3)), np.empty((len(a), 3, 3)), np.empty((len(a), 3, 3))
     for i in range(len(a)):
@@ -62,7 +62,7 @@ def anchored_pluecker_seen_from(T: Array, l: Array) -> View:
     k = len(l)
     v, V_T, V_l = np.empty((k, 3)), np.empty((k, 3, 6)), np.empty((k, 3, 9))
     for i in range(k):
-        n, N_base, N_v = crossed(l[i : i + 1, :3] - T[:3], l[i : i + 1, 6:])
+        n, N_base, N_v = cross_products(l[i : i + 1, :3] - T[:3], l[i : i + 1, 6:])
         n[0] += l[i, 3:6]
         v[i] = Q @ n[0]
         V_l[i, :, :3], V_l[i, :, 3:6], V_l[i, :, 6:] = Q @ N_base[0], Q, Q @ N_v[0]
@@ -78,15 +78,15 @@ def pluecker_seen_from(T: Array, l: Array) -> View:
 
 
 @compiled
-def ends(l: Array, shared: int) -> tuple[Array, Array]:
+def end_states(l: Array, shared: int) -> tuple[Array, Array]:
     """Return the states of both ends of lines l (K, n), whose first `shared` numbers, the anchor, are those of both."""
     own = (l.shape[1] - shared) // 2
     return l[:, : shared + own].copy(), np.hstack((l[:, :shared], l[:, shared + own :]))
 
 
 @compiled
-def joined(A: Array, B: Array, shared: int) -> Array:
-    """Return the Jacobians (K, a, n) in the state of lines from those in both ends' states; the inverse of `ends`."""
+def line_jacobians(A: Array, B: Array, shared: int) -> Array:
+    """Return the Jacobians (K, a, n) in the state of lines by those in both ends' states; inverse of `end_states`."""
     size = A.shape[2]
     J = np.zeros((len(A), A.shape[1], 2 * size - shared))
     J[:, :, :size] = A
@@ -96,35 +96,39 @@ def joined(A: Array, B: Array, shared: int) -> Array:
 
 
 @compiled
-def crossed_views(a: View, b: View, shared: int) -> View:
+def line_views(a: View, b: View, shared: int) -> View:
     """Return what is seen of lines through two points that are seen as a and b."""
-    v, V_a, V_b = crossed(a[0], b[0])
-    return v, chained(V_a, a[1]) + chained(V_b, b[1]), joined(chained(V_a, a[2]), chained(V_b, b[2]), shared)
+    v, V_a, V_b = cross_products(a[0], b[0])
+    return (
+        v,
+        multiply_many(V_a, a[1]) + multiply_many(V_b, b[1]),
+        line_jacobians(multiply_many(V_a, a[2]), multiply_many(V_b, b[2]), shared),
+    )
 
 
 @compiled
 def inverse_depth_line_seen_from(T: Array, l: Array) -> View:
     """Return the normals v (K, 3) of inverse-depth lines l (K, 9), V_T (K, 3, 6) and V_l (K, 3, 9)."""
-    a, b = ends(l, 3)
-    return crossed_views(inverse_depth_seen_from(T, a), inverse_depth_seen_from(T, b), 3)
+    a, b = end_states(l, 3)
+    return line_views(inverse_depth_seen_from(T, a), inverse_depth_seen_from(T, b), 3)
 
 
 @compiled
 def anchored_homogeneous_line_seen_from(T: Array, l: Array) -> View:
     """Return the normals v (K, 3) of anchored homogeneous lines l (K, 11), V_T (K, 3, 6) and V_l (K, 3, 11)."""
-    a, b = ends(l, 3)
-    return crossed_views(anchored_seen_from(T, a), anchored_seen_from(T, b), 3)
+    a, b = end_states(l, 3)
+    return line_views(anchored_seen_from(T, a), anchored_seen_from(T, b), 3)
 
 
 @compiled
 def homogeneous_line_seen_from(T: Array, l: Array) -> View:
     """Return the normals v (K, 3) of homogeneous lines l (K, 8), V_T (K, 3, 6) and V_l (K, 3, 8)."""
-    a, b = ends(l, 0)
-    return crossed_views(homogeneous_seen_from(T, a), homogeneous_seen_from(T, b), 0)
+    a, b = end_states(l, 0)
+    return line_views(homogeneous_seen_from(T, a), homogeneous_seen_from(T, b), 0)
 
 
 @compiled
-def in_plane(n: Array, beta: Array) -> tuple[Array, Array, Array]:
+def vectors_in_planes(n: Array, beta: Array) -> tuple[Array, Array, Array]:
     """Return the vectors v = E(n) beta (K, 3) in the planes of unit normals n (K, 3), V_n (K, 3, 3), V_beta (K, 3, 2).
 
     E(n) has two unit columns: the first, (n_y, -n_x, 0), lies in the image plane too, the second is n x the first.
@@ -153,9 +157,9 @@ def anchored_pluecker_from_view(T: Array, rays: Array, beta: Array) -> New:
     `retroProjPlkLin`.
     """
     Q = matrix(T[3:])
-    normal, N_a, N_b = crossed(rays[:, :3].copy(), rays[:, 3:].copy())
+    normal, N_a, N_b = cross_products(rays[:, :3].copy(), rays[:, 3:].copy())
     n, N_normal = unit_many(normal)
-    v, V_n, V_beta = in_plane(n, beta)
+    v, V_n, V_beta = vectors_in_planes(n, beta)
     k = len(rays)
     l, L_T, L_rays, L_beta = np.empty((k, 9)), np.zeros((k, 9, 6)), np.zeros((k, 9, 6)), np.zeros((k, 9, 2))
     for i in range(k):
@@ -175,7 +179,7 @@ def anchored_pluecker_from_view(T: Array, rays: Array, beta: Array) -> New:
 def anchored_pluecker_to_pluecker(l: Array) -> tuple[Array, Array]:
     """Return the Pluecker lines h (K, 6) of anchored ones l (K, 9), and H_l (K, 6, 9).  [TB] `unanchorPlucker`."""
     h, H_l = np.empty((len(l), 6)), np.zeros((len(l), 6, 9))
-    n, N_anchor, N_v = crossed(l[:, :3].copy(), l[:, 6:].copy())
+    n, N_anchor, N_v = cross_products(l[:, :3].copy(), l[:, 6:].copy())
     for i in range(len(l)):
         h[i, :3], h[i, 3:] = l[i, 3:6] + n[i], l[i, 6:]
         H_l[i, :3, :3], H_l[i, :3, 6:] = N_anchor[i], N_v[i]
@@ -192,7 +196,7 @@ def pluecker_from_view(T: Array, rays: Array, beta: Array) -> New:
     """
     h, H_T, H_rays, H_beta = anchored_pluecker_from_view(T, rays, beta)
     l, L_h = anchored_pluecker_to_pluecker(h)
-    return l, chained(L_h, H_T), chained(L_h, H_rays), chained(L_h, H_beta)
+    return l, multiply_many(L_h, H_T), multiply_many(L_h, H_rays), multiply_many(L_h, H_beta)
 
 
 @compiled
@@ -275,7 +279,7 @@ def segment_noise(y: Array, R4: Array) -> Array:
 def anchored_pluecker_endpoints(l: Array, t: Array) -> tuple[Array, Array]:
     """Return the points p (K, 2, 3) at abscissas t (K, 2) of anchored Pluecker lines l (K, 9), and P_l (K, 2, 3, 9)."""
     v = l[:, 6:].copy()
-    foot, F_v, F_n = crossed(v, l[:, 3:6].copy())
+    foot, F_v, F_n = cross_products(v, l[:, 3:6].copy())
     u, U_v = unit_many(v)
     p, P_l = np.empty((len(l), 2, 3)), np.empty((len(l), 2, 3, 9))
     for i in range(len(l)):
@@ -302,7 +306,7 @@ def pluecker_endpoints(l: Array, t: Array) -> tuple[Array, Array]:
 def points_between(a: tuple[Array, Array], b: tuple[Array, Array], t: Array, shared: int) -> tuple[Array, Array]:
     """Return the points (1 - t) a + t b, t (K, 2), of lines through a, b (K, 3); an unused one may be at infinity."""
     nothing = np.zeros_like(a[1])
-    A_l, B_l = joined(a[1], nothing, shared), joined(nothing, b[1], shared)
+    A_l, B_l = line_jacobians(a[1], nothing, shared), line_jacobians(nothing, b[1], shared)
     p, P_l = np.zeros((len(t), 2, 3)), np.zeros((len(t), 2, 3, A_l.shape[2]))
     for i in range(len(t)):
         for end in range(2):
@@ -348,7 +352,7 @@ def crossing_angles(T: Array, p: Array, rays: Array) -> Array:
     return angles
 
 
-def extended(
+def extend_segments(
     t_old: Array,
     t_measured: Array,
     sigma_px: Array | None = None,
@@ -373,7 +377,7 @@ def extended(
 
 
 @compiled
-def clipped(a: Array, b: Array) -> tuple[float, float]:
+def clip_abscissas(a: Array, b: Array) -> tuple[float, float]:
     """Return the first and last s in [0, 1] with all a + s (b - a) >= 0, a, b (n,); none: first > last."""
     first, last = 0.0, 1.0
     for j in range(len(a)):
@@ -405,7 +409,7 @@ def visible_segment(T: Array, p1: Array, p2: Array, k: Array, size: Array, min_l
     for i in range(len(p1)):
         if not math.isfinite(a[i].sum() + b[i].sum()):
             continue
-        first, last = clipped(from_borders(a[i], k, size), from_borders(b[i], k, size))
+        first, last = clip_abscissas(from_borders(a[i], k, size), from_borders(b[i], k, size))
         if not first <= last:
             continue
         for end, s in ((0, first), (1, last)):

@@ -98,7 +98,7 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
     if diffusion:
         pose_alone = space.world == "plane" and np.shape(diffusion[0]) == (SE2.dof, SE2.dof)
         found.covariance("diffusion", diffusion, SE2.dof if pose_alone else space.dof, at)
-    if (calibrating := protocols.calibrating(model)) is not None:
+    if (calibrating := protocols.self_calibrating(model)) is not None:
         c = len(calibrating.calibration)
         found.covariance("calibration_cov", [calibrating.calibration_cov], c, {})
         _shape("calibration_effect", np.array(calibrating.calibration_effect(u[0], dt_s[0])), (k, c))

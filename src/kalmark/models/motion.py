@@ -42,9 +42,23 @@ from kalmark.models.kinematics import (
 from kalmark.models.observe import CompiledVelocity
 
 __all__ = [
-    "Ackermann", "ConstantTurnRate", "ConstantVelocity", "ConstantVelocity3D", "DifferentialDrive", "Inertial",
-    "InertialGravity", "Mecanum", "Odometry2D", "Odometry3D", "Omnidirectional", "SlippingUnicycle", "Tricycle",
-    "Unicycle", "Velocity3D", "at_rest", "shaken",
+    "Ackermann",
+    "ConstantTurnRate",
+    "ConstantVelocity",
+    "ConstantVelocity3D",
+    "DifferentialDrive",
+    "Inertial",
+    "InertialGravity",
+    "Mecanum",
+    "Odometry2D",
+    "Odometry3D",
+    "Omnidirectional",
+    "SlippingUnicycle",
+    "Tricycle",
+    "Unicycle",
+    "Velocity3D",
+    "noise_densities",
+    "start_at_rest",
 ]  # fmt: skip
 
 
@@ -303,4 +317,4 @@ class ConstantVelocity3D(MotionModel, CompiledVelocity):
 # after those above, which messages and the page of the configuration name first
 from kalmark.models.wheels import DifferentialDrive, Mecanum, Omnidirectional, SlippingUnicycle, Tricycle  # noqa: E402, I001
 from kalmark.models.coasting import ConstantTurnRate, ConstantVelocity  # noqa: E402
-from kalmark.models.inertial import Inertial, InertialGravity, at_rest, shaken  # noqa: E402
+from kalmark.models.inertial import Inertial, InertialGravity, start_at_rest, noise_densities  # noqa: E402

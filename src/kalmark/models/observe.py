@@ -26,7 +26,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
 from kalmark.models import landmark_views, landmarks, sensors
 from kalmark.models.landmark_views import EXPECT, LOOK, VARY, residual
-from kalmark.models.landmarks3d import chained
+from kalmark.models.landmarks3d import multiply_many
 from kalmark.models.protocols import (
     Completing,
     FullSensor,
@@ -59,14 +59,14 @@ call_velocity = by_address(VELOCITY)
 NOTHING = np.zeros(0)
 
 
-def composed(r: Array, mount: Array) -> tuple[Array, Array, Array]:
+def sensor_pose(r: Array, mount: Array) -> tuple[Array, Array, Array]:
     """Return the sensor's pose T = r o mount with T_r and T_s, in the plane (3,) or in space (7,)."""
     return compose(r, mount) if len(r) == 3 else frames3d.compose(r, mount)
 
 
 def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: Array) -> tuple[Array, ...]:
     """Return e = h(v) (K, m) and E_r, E_s, E_l, v being landmarks l (K, n) seen from T = r o mount.  [S] (63)."""
-    T, T_r, T_s = composed(r, mount)
+    T, T_r, T_s = sensor_pose(r, mount)
     v, V_T, V_l = landmark.seen_from(T, l)
     e, E_v = sensor.expect(v)
     return e, E_v @ V_T @ T_r, E_v @ V_T @ T_s, E_v @ V_l  # E_s calibrates the mount, for free
@@ -84,7 +84,7 @@ def landmark_at(
     r: Array, mount: Array, landmark: Landmark, v: Array, V_y: Array, depth: bool = True
 ) -> tuple[Array, ...]:
     """Return the landmarks l (K, n) at v (K, d) in the sensor's frame; see `inverse_expectation`."""
-    T, T_r, T_s = composed(r, mount)
+    T, T_r, T_s = sensor_pose(r, mount)
     N = None
     if isinstance(landmark, Completing):
         v, V_y, N = landmark.complete(v, V_y, depth)
@@ -96,7 +96,7 @@ def landmark_at(
 def _product(A: Array, B: Array) -> Array:
     """Return A B of K matrices A (K, a, b) and B (K, b, c) or (b, c), to the last bit as compiled code has it."""
     B = np.broadcast_to(B, (len(A), *B.shape[-2:]))
-    return chained(np.array(A, dtype=np.float64), np.array(B, dtype=np.float64))
+    return multiply_many(np.array(A, dtype=np.float64), np.array(B, dtype=np.float64))
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class PythonView:
         sensor: Any = self.sensor
         sensor = sensor.with_parameters(head[2 * size :])
         e, E_r, E_s, E_l = expectation(r, mount, sensor, self.landmark, l)
-        E_p = sensor.parameters_jacobian(self.landmark.seen_from(composed(r, mount)[0], l)[0])
+        E_p = sensor.parameters_jacobian(self.landmark.seen_from(sensor_pose(r, mount)[0], l)[0])
         return e, residual(y, e, self.angular), np.concatenate([E_r, E_s, E_p], axis=2), E_l
 
 
@@ -314,9 +314,9 @@ def _linearized(
             par[i] = head[2 * pose + i]
     v, V_T, V_l = landmark_views.look(look_at, (T, l))
     e, z, E_v = landmark_views.expect(expect_at, (code, par, angular, v, y))
-    E_T, E_l = chained(E_v, V_T), chained(E_v, V_l)
+    E_T, E_l = multiply_many(E_v, V_T), multiply_many(E_v, V_l)
     if len(head) == pose:
-        return e, z, turned(E_T, T_r), E_l
+        return e, z, turn_jacobian(E_T, T_r), E_l
     k, p, n = E_T.shape
     E_h = np.zeros((k, p, 2 * n + len(head) - 2 * pose))
     for i in range(k):
@@ -324,18 +324,18 @@ def _linearized(
             for b in range(n):
                 for c in range(n):
                     E_h[i, a, n + c] += E_T[i, a, b] * T_s[b, c]
-    turned(E_T, T_r)
+    turn_jacobian(E_T, T_r)
     for i in range(k):
         for a in range(p):
             for c in range(n):
                 E_h[i, a, c] = E_T[i, a, c]
     if len(head) > 2 * pose:
-        beside(E_h, landmark_views.vary(vary_at, (code, par, angular, v, e)))
+        write_last_columns(E_h, landmark_views.vary(vary_at, (code, par, angular, v, e)))
     return e, z, E_h, E_l
 
 
 @compiled
-def beside(E_h: Array, E_p: Array) -> None:
+def write_last_columns(E_h: Array, E_p: Array) -> None:
     """Write E_p (K, p, c) into the last columns of E_h (K, p, h)."""
     k, p, c = E_p.shape
     for i in range(k):
@@ -345,7 +345,7 @@ def beside(E_h: Array, E_p: Array) -> None:
 
 
 @compiled
-def turned(E_T: Array, T_r: Array) -> Array:
+def turn_jacobian(E_T: Array, T_r: Array) -> Array:
     """Return E_T @ T_r (K, m, n) in place: T_r is the identity except for the rotation of the robot."""
     k, m, n = E_T.shape
     first = 2 if n == 3 else 3

@@ -17,7 +17,7 @@ from kalmark.declare import Estimated, Limit, NotNegative, Number, Positive, dec
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import landmark_views
-from kalmark.models.landmark_views import Cone, Distancing, Expecting, Raised, raised, refuse_negative_ranges
+from kalmark.models.landmark_views import Cone, Distancing, Expecting, Raised, raise_views, refuse_negative_ranges
 
 __all__ = ["Bearing", "Position2D", "Range", "Range3D", "RangeBearing", "RangeBearingSignature"]
 
@@ -67,7 +67,7 @@ def distance(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple
     At v = 0, where a range has no derivative, E_v is 0.
     """
     k, d = v.shape
-    p, e, E_v = raised(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
+    p, e, E_v = raise_views(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
     for i in range(k):
         r = math.sqrt(p[i, 0] * p[i, 0] + p[i, 1] * p[i, 1] + p[i, 2] * p[i, 2])
         e[i, 0] = (r + par[1]) / par[0]

@@ -248,7 +248,7 @@ def finds_depth(sensor: object) -> bool:
     return sensor.finds_depth if isinstance(sensor, _FindsDepth) else True
 
 
-def of_pair(sensor: object) -> bool:
+def has_second_camera(sensor: object) -> bool:
     """Return whether a frame of the sensor has the image of a second camera, to the right; by default not."""
     return sensor.of_pair if isinstance(sensor, _OfPair) else False
 
@@ -283,7 +283,7 @@ def coasts(motion: object) -> bool:
     return motion.coasts if isinstance(motion, _Coasts) else False
 
 
-def calibrating(motion: object) -> SelfCalibrating | None:
+def self_calibrating(motion: object) -> SelfCalibrating | None:
     """Return a motion of which constants are in the map; by default None: it has none."""
     return motion if isinstance(motion, SelfCalibrating) and motion.calibration else None
 
@@ -582,7 +582,7 @@ _OF: dict[type, tuple[type, ...]] = {
 _NEAR = 0.85  # of difflib: "see" is near "sees", "extent" is not near "extend"
 
 
-def refuse_misspelt(model: object, what: str) -> None:
+def refuse_misspelt_names(model: object, what: str) -> None:
     """Refuse a user's model with a public name near that of a capability which the model does not have.
 
     Raises ModelError with both names.  kalmark's own models are not looked at.

@@ -16,7 +16,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, Limit, Number, Positive, declared, register
-from kalmark.models.landmark_views import Distancing, Raised, raised
+from kalmark.models.landmark_views import Distancing, Raised, raise_views
 
 __all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
 
@@ -28,7 +28,7 @@ DECIBELS = 10.0 / math.log(10.0)  # in one unit of a natural logarithm of power
 def strength(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Expect the strength of what is at v (K, d): `par` = (strength at 1 m, exponent, height).  Log-distance."""
     k, d = v.shape
-    p, e, E_v = raised(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
+    p, e, E_v = raise_views(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
     for i in range(k):
         square = NEAREST_M * NEAREST_M
         for j in range(3):
@@ -49,10 +49,10 @@ def by_path_loss(code: int, par: Array, angular: Flags, v: Array, e: Array) -> A
 
 
 @compiled
-def difference(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+def range_difference(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Expect how much farther v (K, d) is from the right receiver than the left one; `par` = (baseline, height)."""
     k, d = v.shape
-    p, e, E_v = raised(v, par[1]), np.zeros((k, 1)), np.zeros((k, 1, d))
+    p, e, E_v = raise_views(v, par[1]), np.zeros((k, 1)), np.zeros((k, 1, d))
     for i in range(k):
         for sign in (1.0, -1.0):  # the right receiver is at y = -par / 2
             square = NEAREST_M * NEAREST_M
@@ -143,7 +143,7 @@ class _RangeDifference(_Receiver):
 
     columns: ClassVar[tuple[str, ...]] = ("difference_m",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",)
-    expected: ClassVar[Any] = difference
+    expected: ClassVar[Any] = range_difference
 
     @cached_property
     def parameters(self) -> Array:

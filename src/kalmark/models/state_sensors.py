@@ -160,13 +160,13 @@ def increment(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tupl
 
 # ------------------------------------------------------------------ and how that changes with the sensor's constants
 @compiled
-def less(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+def subtract_constant(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
     """Return E_p (1, 1, 1) of a constant that is taken off."""
     return -np.ones((1, 1, 1))
 
 
 @compiled
-def plus(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
+def add_constants(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
     """Return E_p (1, m, c) of constants that are added to the last numbers of a measurement."""
     m, c = e.shape[1], len(par)
     E_p = np.zeros((1, m, c))
@@ -178,7 +178,7 @@ def plus(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
 @compiled
 def plus_gravity(code: int, par: Array, angular: Flags, v: Array, e: Array) -> Array:
     """Return E_p (1, 3, 4) of g and of the biases of an accelerometer."""
-    Q, E_p = matrix(v[0, 3:].copy()), plus(code, par, angular, v, e)
+    Q, E_p = matrix(v[0, 3:].copy()), add_constants(code, par, angular, v, e)
     for i in range(3):
         E_p[0, i, 0] = Q[2, i]
     return E_p
@@ -283,7 +283,7 @@ class Heading(StateSensor):
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_heading_rad",)
     views: ClassVar[str] = POSE
     expected: ClassVar[Any] = heading
-    varied: ClassVar[Any] = less
+    varied: ClassVar[Any] = subtract_constant
     constants: ClassVar[tuple[tuple[str, str, str], ...]] = (("declination_rad", "sigma_declination_rad", ""),)
 
 
@@ -300,7 +300,7 @@ class _Gps(StateSensor):
 
     views: ClassVar[str] = POSE
     expected: ClassVar[Any] = antenna
-    varied: ClassVar[Any] = plus
+    varied: ClassVar[Any] = add_constants
 
 
 @register("sensor", "gps")
@@ -393,7 +393,7 @@ class Height(StateSensor):
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_z_m",)
     views: ClassVar[str] = POSE
     expected: ClassVar[Any] = height
-    varied: ClassVar[Any] = plus
+    varied: ClassVar[Any] = add_constants
     constants: ClassVar[tuple[tuple[str, str, str], ...]] = (("bias_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s"),)
 
 
@@ -447,7 +447,7 @@ class _Gyro(StateSensor):
     views: ClassVar[str] = TWIST
     sees_rates: ClassVar[bool] = True
     expected: ClassVar[Any] = rates
-    varied: ClassVar[Any] = plus
+    varied: ClassVar[Any] = add_constants
 
     def __post_init__(self) -> None:
         if not (self.sigma_radps or self.sigma_rad_per_sqrt_s):

@@ -102,8 +102,8 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
     v, V_y, cost = np.full((k, 2, 7), np.nan), np.full((k, 2, 6, 8), np.nan), np.full((k, 2), np.nan)
     for i in range(k):
         first, second = from_homography(rays[i], size[i])
-        a, E_a, cost_a = refined(lens, y[i], size[i], first, par)
-        b, E_b, cost_b = refined(lens, y[i], size[i], second, par)
+        a, E_a, cost_a = refine_pose(lens, y[i], size[i], first, par)
+        b, E_b, cost_b = refine_pose(lens, y[i], size[i], second, par)
         if cost_b < cost_a or math.isnan(cost_a):
             a, b, E_a, E_b, cost_a, cost_b = b, a, E_b, E_a, cost_b, cost_a
         if math.isnan(cost_a):
@@ -112,7 +112,7 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
         apart = minus(a, b)
         same = np.abs(apart[:3]).max() < SAME * size[i] and np.abs(apart[3:]).max() < SAME
         if same or math.isnan(cost_b):
-            b, cost_b = mirrored(a), np.inf
+            b, cost_b = mirror_pose(a), np.inf
             if np.abs(minus(b, a)).max() > FACING:
                 e = project_corners(lens, b.reshape((1, 7)), np.array([size[i]]), par)[0]
                 cost_b = np.sum((y[i] - e[0]) ** 2)
@@ -123,7 +123,7 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
 
 
 @compiled
-def refined(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple[Array, Array, float]:
+def refine_pose(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple[Array, Array, float]:
     """Minimise |y - e(v)|^2 from a start (7,) by Levenberg's method: v (7,), E_v (8, 6), the least sum; or NaN."""
     v, sizes, damping = start.copy().reshape((1, 7)), np.array([size]), 1e-3
     e, E_v = project_corners(lens, v, sizes, par)
@@ -186,11 +186,11 @@ def from_homography(m: Array, size: float) -> tuple[Array, Array]:
     )
     first = np.empty(7)
     first[:3], first[3:] = H[:, 2] * size / (a0 + a1), from_matrix(Q)
-    return first, mirrored(first)
+    return first, mirror_pose(first)
 
 
 @compiled
-def mirrored(v: Array) -> Array:
+def mirror_pose(v: Array) -> Array:
     """Return a tag's pose (7,) mirrored in the plane through its centre across the line of sight, and in its own."""
     sight = v[:3] / math.sqrt(np.sum(v[:3] ** 2))
     mirror = np.eye(3) - 2.0 * sight.reshape((3, 1)) * sight

@@ -22,8 +22,8 @@ from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose
 from kalmark.models import landmark_views
 from kalmark.models.landmark_views import EXPECT, LOOK, residual
-from kalmark.models.landmarks3d import chained
-from kalmark.models.observe import LINEARIZE, VELOCITY, View, composed, is_built_in
+from kalmark.models.landmarks3d import multiply_many
+from kalmark.models.observe import LINEARIZE, VELOCITY, View, is_built_in, sensor_pose
 from kalmark.models.protocols import TWIST, Landmark, Sensor, tells_velocity, velocity_in
 from kalmark.models.state_view import CHAIN, CHAINS, call_chain, carried_in_plane, carried_in_space
 
@@ -42,7 +42,7 @@ def linearize_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array
     pose = len(marked) - 1
     at, r = marked[:pose].copy(), head[:pose].copy()
     t, t_r, _t_s, t_x = call_chain(chain_at, (r, at, head[pose:].copy(), since, velocity))
-    T, T_r = placed(r, at)
+    T, T_r = moving_sensor_pose(r, at)
     p, P_T, P_l = landmark_views.look(look_at, (T, l))
     k, d, n, m = p.shape[0], p.shape[1], T_r.shape[0], y.shape[1]
     v = np.empty((k, 2 * d))
@@ -51,7 +51,7 @@ def linearize_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array
             v[i, a], v[i, d + a] = p[i, a], t[a]
     e, z, E_v = landmark_views.expect(expect_at, (0, since, angular, v, y))
     E_p, E_h = E_v[:, :, :d].copy(), np.zeros((k, m, n + t_x.shape[1]))
-    E_T, E_l = chained(E_p, P_T), chained(E_p, P_l)
+    E_T, E_l = multiply_many(E_p, P_T), multiply_many(E_p, P_l)
     for i in range(k):
         E_t = E_v[i, :, d:].copy()
         E_h[i, :, :n] = E_T[i] @ T_r + E_t @ t_r[:d].copy()
@@ -60,7 +60,7 @@ def linearize_moving(view: View, head: Array, l: Array, y: Array) -> tuple[Array
 
 
 @compiled
-def placed(r: Array, at: Array) -> tuple[Array, Array]:
+def moving_sensor_pose(r: Array, at: Array) -> tuple[Array, Array]:
     """Return the sensor's pose T = r o at, (3,) or (7,), and T_r."""
     if len(r) == 3:
         T, T_r, _T_s = compose(r, at)
@@ -89,7 +89,7 @@ class PythonMovingView:
         """Return e, z (K, m), E_h (K, m, h) and E_l (K, m, n), as `linearize_moving` does."""
         pose = len(self.at)
         t, t_r, t_x = velocity_of(self.motion, self.at, head[:pose], head[pose:], self.since)
-        T, T_r, _ = composed(head[:pose], self.at)
+        T, T_r, _ = sensor_pose(head[:pose], self.at)
         p, P_T, P_l = self.landmark.seen_from(T, l)
         e, E_v = self.sensor.expect(np.concatenate([p, np.tile(t, (len(p), 1))], axis=1))
         E_p, E_t = E_v[:, :, : p.shape[1]], E_v[:, :, p.shape[1] :]

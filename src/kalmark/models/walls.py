@@ -76,7 +76,7 @@ def wall(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Arr
     return e, z, E_v
 
 
-def facing(y: Array) -> Array:
+def orient_segments(y: Array) -> Array:
     """Return segments y (K, 4) with distances of at least 0: the same lines, with the opposite normals."""
     other = np.column_stack([-y[:, 0], wrap(y[:, 1] + math.pi), -y[:, 3], -y[:, 2]])
     return np.asarray(np.where(y[:, :1] < 0.0, other, y))

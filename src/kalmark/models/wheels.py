@@ -81,7 +81,7 @@ def mecanum(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Ar
 
 
 @compiled
-def slipping(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
+def move_with_slip(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
     """Move r (4,) = (pose, slip) by u (2,) = (v, w) for dt s, with the velocity slip v to the left; R_u (4, 2)."""
     v = np.array([u[0], r[3] * u[0], u[1]])
     pose, P_r, P_v = screw(r[:3].copy(), v, dt)
@@ -296,7 +296,7 @@ class SlippingUnicycle(SpeedAndTurn):
     sigma_slip_per_sqrt_s: Annotated[NotNegative, "Random walk of the slip, while it moves."] = 0.02
 
     space: ClassVar[Space] = Space("SE2 with slip", (VECTOR, HEADING, SCALAR))
-    moves: ClassVar[Any] = slipping
+    moves: ClassVar[Any] = move_with_slip
     state_columns: ClassVar[tuple[str, ...]] = ("slip",)
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:

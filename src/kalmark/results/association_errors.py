@@ -16,7 +16,7 @@ from kalmark.results.recording import Recording
 LEAST = 3  # matched pairs
 
 
-def known_as(history: History) -> dict[str, str]:
+def names_in_log(history: History) -> dict[str, str]:
     """Return what the log calls each landmark that the filter named: what most observations fused with it are."""
     seen: defaultdict[str, Counter[str]] = defaultdict(Counter)
     mine = history.fused & (history.true_id != "") & (history.id == "")
@@ -27,7 +27,7 @@ def known_as(history: History) -> dict[str, str]:
 
 def best_known(history: History, ids: list[Id], observations: list[int]) -> dict[Id, Id]:
     """Return the log's name of each landmark of a map that has one; of several of one name the most seen has it."""
-    names = known_as(history)
+    names = names_in_log(history)
     taken: dict[str, tuple[int, Id]] = {}
     for i, count in zip(ids, observations, strict=True):
         name = names.get(str(i))
@@ -46,7 +46,7 @@ def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]
     hidden = (history.id == "") & (history.true_id != "")
     if not hidden.any():
         return {}
-    names, fused = known_as(history), history.fused
+    names, fused = names_in_log(history), history.fused
     judged = fused & hidden
     own = [names[landmark] for landmark in history.landmark[judged].tolist()]
     nameless = history.true_id == ""

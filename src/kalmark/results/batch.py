@@ -14,9 +14,9 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
-from kalmark.batch.data import Associations, BatchInput, BatchReplay, Known, replayed
+from kalmark.batch.data import Associations, BatchInput, BatchReplay, Known, replay_events
 from kalmark.batch.problem import Problem
-from kalmark.batch.reassociation import ROUNDS, Reassociated, reassociated
+from kalmark.batch.reassociation import ROUNDS, Reassociated, reassociate
 from kalmark.batch.solver import Batch, optimum
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Id, Scan
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
-    """Return the entry `batch` of a run's summary: `compare`, or of a run that saw tags `compare_tags`.
+    """Return the entry `batch` of a run's summary: `compare_with_filter`, or of a run that saw tags `compare_tags`.
 
     The association of observations without ids in the log is decided again (`second_opinion`).  The log
     is read again unless it is given or not needed.
@@ -51,12 +51,12 @@ def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dic
     if not np.isnan(run.history.left_px).all():
         problem = tag_problem(run)
         return compare_tags(run, problem, optimum(problem))
-    log = log_of(run) if log is None else log
+    log = log_of_run(run) if log is None else log
     walls = any(isinstance(track.model, Wall2D) for track in run.final_slam().tracks.confirmed.values())
     if walls or not unknown(run).any():
-        return compare(run, solve_batch(run, log))
+        return compare_with_filter(run, solve_batch(run, log))
     opinion = second_opinion(run, log)
-    return compare(run, opinion.found.batch, opinion.found.merged) | opinion.as_dict()
+    return compare_with_filter(run, opinion.found.batch, opinion.found.merged) | opinion.as_dict()
 
 
 def unknown(run: Recording) -> Flags:
@@ -102,9 +102,9 @@ def second_opinion(run: Recording, log: Log | Iterable[Event], *, known: Known |
     """
     open_ = unknown(run)
     rows = np.flatnonzero(run.history.fused | open_)
-    given = given_by(run, known, rows)
+    given = batch_input(run, known, rows)
     numbers = track(range(1, ROUNDS + 1), "second opinion: round of association")
-    found = reassociated(BatchReplay.of(given, log), open_[rows], numbers)
+    found = reassociate(BatchReplay.of(given, log), open_[rows], numbers)
     changed = added = left_out = 0
     made_of: dict[Id, list[bool]] = {name: [] for name in found.new}
     for before, after in zip(given.associations.landmark, found.landmark, strict=True):
@@ -134,12 +134,12 @@ def solve_batch(
     filter rejected are left out.
     Raises KalmarkError if something is not determined, or if it does not converge within `iterations`.
     """
-    problem = replayed(given_by(run, known), log)
+    problem = replay_events(batch_input(run, known), log)
     steps = track(range(1, iterations + 1), "batch solution: iteration", show=progress)
     return optimum(problem, initial, iterations=steps)
 
 
-def given_by(run: Recording, known: Known | None = None, rows: Index | None = None) -> BatchInput:
+def batch_input(run: Recording, known: Known | None = None, rows: Index | None = None) -> BatchInput:
     """Return what the batch solution needs of a run: of the observations exactly those that the filter used.
 
     With `rows` of the history these are read; those that the filter did not use are of no landmark.
@@ -233,7 +233,7 @@ def _surveyed(history: History) -> Known:
     return {as_id(prior.landmark): (prior.mean, prior.covariance) for prior in points}
 
 
-def of_the_filter_alone(slam: Slam) -> set[tuple[str, str]]:
+def filter_only_sensors(slam: Slam) -> set[tuple[str, str]]:
     """Return the sensors (robot, name) whose readings no batch solution has: of the state, and of range rates."""
     mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
     return {key for key, mount in mounted.items() if isinstance(mount.sensor, SeesVelocity | OfState)}
@@ -244,7 +244,7 @@ def _of_places(history: History, slam: Slam, rows: Index) -> Index:
 
     Readings of the state do not, nor do range rates.
     """
-    others = of_the_filter_alone(slam)
+    others = filter_only_sensors(slam)
     if not others:
         return rows
     keys = zip(history.robot[history.step[rows]].tolist(), history.sensor[rows].tolist(), strict=True)
@@ -314,10 +314,10 @@ def tag_problem(run: Recording) -> Problem:
     )
     y = np.split(history.y[rows, :9], first[1:])
     scans = zip(t_ns.tolist(), robot.tolist(), sensor[first].tolist(), y, strict=True)
-    return replayed(given, (Scan(t_ns=t, robot=name, sensor=camera, y=seen) for t, name, camera, seen in scans))
+    return replay_events(given, (Scan(t_ns=t, robot=name, sensor=camera, y=seen) for t, name, camera, seen in scans))
 
 
-def compare(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None) -> dict[str, Any]:
+def compare_with_filter(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None) -> dict[str, Any]:
     """Return how far the filter's map and path are from the optimum of the same data.
 
     `merged` maps landmarks of the filter to those of the batch solution that they were merged into.
@@ -407,7 +407,7 @@ def compare_tags(run: Recording, problem: Problem, batch: Batch) -> dict[str, An
     }
 
 
-def log_of(run: Recording) -> Iterable[Event]:
+def log_of_run(run: Recording) -> Iterable[Event]:
     """Return the log a run was made from, read again by its configuration if the run does not hold it."""
     if run.source is not None:
         return run.source

@@ -15,6 +15,6 @@ class Sign(NamedTuple):
     status: str = OK
 
 
-def worst(*statuses: str) -> str:
+def worst_status(*statuses: str) -> str:
     """Return the worst of some statuses, ok without any."""
     return max(statuses, key=STATUSES.index, default=OK)

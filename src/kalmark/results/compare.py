@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 from kalmark.arrays import Array
 from kalmark.errors import RunError
-from kalmark.events import shown
+from kalmark.events import short_text
 from kalmark.results.evaluate import summary_of
-from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, figure, header
+from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, column_header, figure
 from kalmark.results.history import Ints
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.plot import draw_plan, legend
@@ -42,7 +42,7 @@ class Comparison:
 
     def tables(self) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
         """Yield the tables: their titles and rows, a label and what each run has."""
-        words = {key: header(label, unit) for key, label, unit in (*MORE, *BATCH, *TOTALS, *ROBOT)}
+        words = {key: column_header(label, unit) for key, label, unit in (*MORE, *BATCH, *TOTALS, *ROBOT)}
         words["path_difference_m"] = "path off the first run's, aligned (m)"
         for part in dict.fromkeys(part for told in self.figures.values() for part in told):
             mine = [told.get(part, {}) for told in self.figures.values()]
@@ -111,7 +111,7 @@ def _differing(runs: Mapping[str, Recording]) -> dict[str, list[str]]:
     """Return the keys in which configurations differ, and what each has."""
     flat = [dict(_flat(run.config)) for run in runs.values()]
     keys = dict.fromkeys(key for each in flat for key in each)
-    values = {key: [shown(each[key]) if key in each else "-" for each in flat] for key in keys}
+    values = {key: [short_text(each[key]) if key in each else "-" for each in flat] for key in keys}
     return {k: v for k, v in values.items() if k not in OF_ITS_OWN and any(a != b for a, b in pairwise(v))}
 
 

@@ -18,7 +18,7 @@ RULED_OUT = "ruled_out"  # the kind of a gap that is made: of controls beyond th
 NOTED, NOTED_S = 0.2, 0.5  # of a metre or a radian, sigmas above which a longer gap is worth a line
 
 
-def joined(found: list[Gap]) -> tuple[Gap, ...]:
+def merge_gaps(found: list[Gap]) -> tuple[Gap, ...]:
     """Return the gaps of which these are parts, each with all by which the pose was widened for it."""
     whole: dict[tuple[str, str, int], Gap] = {}
     for gap in found:
@@ -75,17 +75,17 @@ def _before(history: History, gap: Gap) -> float:
     return float(np.sqrt(np.trace(history.covariance[earlier[-1], : history.d, : history.d]) / history.d))
 
 
-def matters(gap: dict[str, Any]) -> bool:
+def is_reported(gap: dict[str, Any]) -> bool:
     """Return whether a gap left the pose so uncertain that it is worth a line."""
     return max(gap["sigma_m"], gap["sigma_rad"]) > NOTED and gap["end_s"] - gap["start_s"] > NOTED_S
 
 
 def stayed_lost(gap: dict[str, Any]) -> bool:
     """Return whether a robot was not localized again after a gap that was bridged."""
-    return gap["action"] == "widen" and gap["known_s"] is None and matters(gap)
+    return gap["action"] == "widen" and gap["known_s"] is None and is_reported(gap)
 
 
-def left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
+def controls_left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
     """Yield of each robot the time, s of the log, and a line of the controls that were beyond its limits."""
     odd = [gap for gap in summary.get("gaps", ()) if gap["kind"] == RULED_OUT]
     for robot in dict.fromkeys(gap["robot"] for gap in odd):
@@ -99,8 +99,8 @@ def left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
 
 def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
     """Yield a line a robot of the gaps that were bridged, and of controls that were left out."""
-    yield from (line for _, line in left_out({"gaps": gaps}))
-    noted = [gap for gap in gaps if matters(gap) and gap["kind"] != RULED_OUT]
+    yield from (line for _, line in controls_left_out({"gaps": gaps}))
+    noted = [gap for gap in gaps if is_reported(gap) and gap["kind"] != RULED_OUT]
     for robot in dict.fromkeys(gap["robot"] for gap in noted):
         mine = [gap for gap in noted if gap["robot"] == robot]
         longest = max(mine, key=lambda gap: gap["end_s"] - gap["start_s"])

@@ -20,10 +20,10 @@ from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks
 from kalmark.results.measures import (
     Rigid,
     aligned_rmse,
-    diverged,
-    identity,
-    most_nees,
+    has_diverged,
+    identity_alignment,
     nees,
+    nees_limit,
     nis,
     path_m,
     pose_error,
@@ -35,7 +35,7 @@ from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_figures, repeat_notes
 from kalmark.results.restarts import restarts
 from kalmark.results.self_calibration import bias_figures, mount_figures
-from kalmark.results.truth import Truth, fitted
+from kalmark.results.truth import Truth, poses_of_size
 from kalmark.results.warnings import advice, fix_nis_per_dof, warnings, window_figures
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
@@ -169,7 +169,7 @@ def robot_figures(run: Recording, name: str) -> dict[str, Any]:
         if any(isinstance(s, dict) and s.get("detector") for s in run.sections(name).values()) and mean.shape[1] == 7:
             figures |= scale_figures(mean[known, :3], truth[known, :3])
             if scale_is_free(run, name):
-                figures |= of_a_free_scale(mean[known], P[known], truth[known])
+                figures |= free_scale_figures(mean[known], P[known], truth[known])
     elif name in run.truth.fixes:
         figures |= fix_figures(fix_distances(run, name))
     return figures
@@ -189,10 +189,10 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
         "ate_raw_m": rmse(world[:, :d]),
         "heading_rmse_deg": float(np.degrees(rmse(world[:, d:]))),
         "pose_nees": _mean(nees(own, P)),
-        "pose_nees_most": most_nees(own, P),
+        "pose_nees_most": nees_limit(own, P),
         "pose_nees_world": _mean(nees(world, P)),
         "path_m": path_m(truth[:, :d]),
-        "diverged": diverged(own[:, :d], P[:, :d, :d], error_m, truth[:, :d]),
+        "diverged": has_diverged(own[:, :d], P[:, :d, :d], error_m, truth[:, :d]),
     }
 
 
@@ -211,7 +211,7 @@ def sees_no_scale(run: Recording, name: str) -> bool:
     )  # fmt: skip
 
 
-def of_a_free_scale(mean: Array, P: Array, truth: Array) -> dict[str, Any]:
+def free_scale_figures(mean: Array, P: Array, truth: Array) -> dict[str, Any]:
     """Return the figures of a path (N, 7) that compare it with the truth in units of its sigmas (N, 6, 6).
 
     The covariance is of a world whose scale begins with a guess, so there is no NEES; it has diverged if it does after
@@ -221,7 +221,7 @@ def of_a_free_scale(mean: Array, P: Array, truth: Array) -> dict[str, Any]:
     error = fit(scale * mean[:, :3]) - truth[:, :3]
     turn = scale * fit.rotation
     sigmas = turn @ P[:, :3, :3] @ turn.T
-    lost = diverged(error, sigmas, np.linalg.norm(error, axis=1), truth[:, :3])
+    lost = has_diverged(error, sigmas, np.linalg.norm(error, axis=1), truth[:, :3])
     return {"pose_nees": None, "pose_nees_most": None, "pose_nees_world": None, "diverged": lost}
 
 
@@ -306,7 +306,7 @@ def _sigma(P: Array) -> float:
 def path_at(history: History, robot: str, t_ns: Ints, max_gap_s: float = FIX_GAP_S) -> Array:
     """Return planar poses (N, 3) of a robot's path interpolated at times, NaN outside it and across long gaps."""
     mine = history.robot == robot
-    t, mean = history.t_ns[mine], fitted(history.poses[mine], 3)
+    t, mean = history.t_ns[mine], poses_of_size(history.poses[mine], 3)
     out = np.full((len(t_ns), 3), np.nan)
     if len(t) < 2:
         return out
@@ -334,7 +334,7 @@ def aligned_fixes(run: Recording, robot: str) -> tuple[Rigid, Array, Array, Arra
     antenna = poses[:, :2] + offset
     known = np.isfinite(antenna).all(axis=1) & np.isfinite(fixes.xy).all(axis=1)
     antenna, offset, xy = antenna[known], offset[known], fixes.xy[known]
-    return rigid_robust(antenna, xy) if len(xy) > 1 else identity(), antenna, offset, xy, fixes.t_ns[known]
+    return rigid_robust(antenna, xy) if len(xy) > 1 else identity_alignment(), antenna, offset, xy, fixes.t_ns[known]
 
 
 def fix_distances(run: Recording, robot: str) -> Array:

@@ -11,9 +11,9 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import RunError
-from kalmark.events import seconds as short
+from kalmark.events import seconds_text as short
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.logs.source import seconds
+from kalmark.logs.source import seconds_text
 from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth
 from kalmark.report import Candidate
 from kalmark.results.figure_texts import count, figure
@@ -110,9 +110,9 @@ def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation
     in_log = -AROUND_S <= t_s - begin <= span + AROUND_S
     since = t_s - begin if in_log else t_s
     if not -AROUND_S <= since <= span + AROUND_S:
-        first, last = seconds(history.t_ns[0]), seconds(history.t_ns[-1])
+        first, last = seconds_text(history.t_ns[0]), seconds_text(history.t_ns[-1])
         raise RunError(f"scan is {t_s:g} s, expected {first} to {last} s of the log, or 0 to {span:.3f} s since then")
-    told = with_known(run, explained(run, int(steps[np.argmin(np.abs(t[steps] - since))])))
+    told = with_known(run, explain_step(run, int(steps[np.argmin(np.abs(t[steps] - since))])))
     return replace(told, asked=f"{t_s:.12g} s {'in the log' if in_log else 'since the first scan'} was asked for")
 
 
@@ -158,7 +158,7 @@ def _seen(slam: Slam, told: Explanation, y: Array) -> Array:
     return out
 
 
-def explained(run: Recording, step: int) -> Explanation:
+def explain_step(run: Recording, step: int) -> Explanation:
     """Return why the scan of a step became what it did."""
     history = run.history
     rows = np.flatnonzero(history.step == step)

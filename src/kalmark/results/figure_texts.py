@@ -22,7 +22,7 @@ TOTALS, MORE, ROBOT, BATCH = (
 )
 
 
-def in_words(figures: Mapping[str, Any], words: Words) -> Iterator[tuple[str, str, Any, str]]:
+def rows_with_labels(figures: Mapping[str, Any], words: Words) -> Iterator[tuple[str, str, Any, str]]:
     """Yield key, label, value and unit of each figure in the order of the words; last, by its key, what has none."""
     known = {key: (label, unit) for key, label, unit in words}
     for key in [*(key for key in known if key in figures), *(key for key in figures if key not in known)]:
@@ -40,7 +40,7 @@ def difference_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return [(r["robot"], *(f"{r[key]:.1f}" for key in ("start_s", "end_s")), figure(r["sigmas"])) for r in rows]
 
 
-def header(label: str, unit: str) -> str:
+def column_header(label: str, unit: str) -> str:
     """Return the words at the top of a column of figures: position RMSE (m)."""
     return f"{label.strip()} ({unit})" if unit else label.strip()
 

@@ -13,7 +13,7 @@ from kalmark.events import Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
 from kalmark.logs.log import Log
-from kalmark.models.protocols import calibrating, parameter_names
+from kalmark.models.protocols import parameter_names, self_calibrating
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import Biased, CalibratedMount, Camera, Measuring
@@ -88,7 +88,7 @@ def sensors(slam: Slam) -> tuple[Measuring, ...]:
     )
 
 
-def mounts(slam: Slam) -> tuple[CalibratedMount, ...]:
+def calibrated_mounts(slam: Slam) -> tuple[CalibratedMount, ...]:
     """Return the mounts of the sensors that calibrate themselves, as estimated and as given."""
     named = {f"{robot.name}.{key}": mount for robot in slam.robots.values() for key, mount in robot.sensors.items()}
     return tuple(
@@ -105,7 +105,7 @@ def biases(slam: Slam) -> tuple[Biased, ...]:
     return tuple(
         Biased(robot.name, model.calibration, slam.mean(name), slam.covariance(name))
         for robot in slam.robots.values()
-        if (model := calibrating(robot.motion)) is not None and _in_map(slam, name := bias_name(robot.name))
+        if (model := self_calibrating(robot.motion)) is not None and _in_map(slam, name := bias_name(robot.name))
     )
 
 
@@ -146,7 +146,7 @@ def stated_noise(slam: Slam, report: Report) -> Array:
     return np.sqrt(np.einsum("kii->ki", R))
 
 
-def left_px(slam: Slam, scan: Scan, report: Report) -> Array:
+def residual_px(slam: Slam, scan: Scan, report: Report) -> Array:
     """Return what a scan's correction leaves of each observation (K,): the RMS of a tag's corners, NaN of all else.
 
     `slam` is the filter just after the scan; an observation that it did not use has NaN, too.

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.events import Id, listed
+from kalmark.events import Id, list_names
 from kalmark.report import Gap
 
 Ints = Index
@@ -203,9 +203,9 @@ class History:
     measured `y` and expected `e` (O, m), innovation `z` (O, p) and its covariance `Z` (O, p, p).  All are padded with
     NaN where robots or sensors differ in size.  `late` (O,) marks the tentative ones that were fused when their
     landmark was confirmed.  `left_px` (O,) is the error of the corners of tags after the scan
-    (`kalmark.results.filter_description.left_px`).  `noise` (O, p) are the sigmas stated of z, NaN where they are not
-    of its numbers.  `seen_at` (O, d) is the place of each observation without an id by the pose before the scan, NaN
-    where its sensor measures none.
+    (`kalmark.results.filter_description.residual_px`).  `noise` (O, p) are the sigmas stated of z, NaN where they
+    are not of its numbers.  `seen_at` (O, d) is the place of each observation without an id by the pose before the
+    scan, NaN where its sensor measures none.
 
     Observations `candidate_row` (C,) were compared with landmarks, `candidate_landmark` (C,), of distance
     `candidate_d2` (C,), that were at `candidate_place` (C, d) in the map; `share_row` (W,) were averaged over landmarks
@@ -276,7 +276,7 @@ class History:
     stepped: str = "scan"
 
     def __repr__(self) -> str:
-        return f"<History of {listed(self.robots)}: {len(self.t_ns)} steps, {len(self.outcome)} observations>"
+        return f"<History of {list_names(self.robots)}: {len(self.t_ns)} steps, {len(self.outcome)} observations>"
 
     @property
     def scans(self) -> int:
@@ -356,7 +356,9 @@ class History:
         named |= {
             "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
             "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
-            "map_shape": padded([m.shape for m in self.maps], [len(m.ids) for m in self.maps], width, matrices=True),
+            "map_shape": pad_blocks(
+                [m.shape for m in self.maps], [len(m.ids) for m in self.maps], width, matrices=True
+            ),
             "map_robot": np.array([m.robots for m in self.maps]).reshape(
                 len(self.maps), -1 if self.maps else 0, self.d, self.d
             ),
@@ -364,7 +366,7 @@ class History:
             "map_landmark": texts([i for m in self.maps for i in m.ids]),
             "map_kind": texts([kind for m in self.maps for kind in m.kinds]),
             "map_mean": padded_all([mean for m in self.maps for mean in m.means]),
-            "map_covariance": padded(blocks, [len(block) for block in blocks], width, matrices=True),
+            "map_covariance": pad_blocks(blocks, [len(block) for block in blocks], width, matrices=True),
         }
         named["stepped"] = np.array(self.stepped, dtype=np.str_)
         named["control_robot"] = texts(list(self.controls))
@@ -377,7 +379,7 @@ class History:
     def from_arrays(cls, named: Named) -> History:
         """Return the history that `arrays` gave.  Raises KeyError if one is missing."""
         given: dict[str, Any] = {name: named[name] for name in _array_fields()}
-        given |= {name: rows_of(prefix, kind, named, joined) for name, (prefix, kind, joined) in ROWS.items()}
+        given |= {name: rows_of_arrays(prefix, kind, named, joined) for name, (prefix, kind, joined) in ROWS.items()}
         ends, keys = np.cumsum(named["map_size"])[:-1], ("mean", "covariance", "landmark", "kind", "shape")
         parts = zip(*(np.split(named[f"map_{key}"], ends) for key in keys), strict=True)
         times = zip(
@@ -427,7 +429,7 @@ def columns(prefix: str, cls: type[R], rows: Sequence[R], joined: bool = False) 
     return named | ({prefix: texts(["\n".join(line) for line in lines])} if joined else {})
 
 
-def rows_of(prefix: str, cls: type[R], named: Named, joined: bool = False) -> tuple[R, ...]:
+def rows_of_arrays(prefix: str, cls: type[R], named: Named, joined: bool = False) -> tuple[R, ...]:
     """Return the rows that `columns` gave."""
     told: list[list[Any]] = []
     lines = iter(zip(*(text.split("\n") for text in named[prefix].tolist()), strict=True)) if joined else iter(())
@@ -448,7 +450,7 @@ def texts(values: list[Any]) -> Texts:
     return np.array(["" if value is None else str(value) for value in values], dtype=np.str_)
 
 
-def padded(blocks: list[Array], counts: list[int], width: int, matrices: bool = False) -> Array:
+def pad_blocks(blocks: list[Array], counts: list[int], width: int, matrices: bool = False) -> Array:
     """Stack blocks (K, m) or (K, m, m) of several sizes m, K by `counts`, padded with NaN; an empty one is all NaN."""
     out = np.full((sum(counts), width, width) if matrices else (sum(counts), width), np.nan)
     whole = [len(block) == count and block.size > 0 for block, count in zip(blocks, counts, strict=True)]

@@ -16,8 +16,8 @@ from functools import partial
 from typing import Any, Protocol, TextIO
 
 from kalmark.errors import DivergedError, EventError, KalmarkError
-from kalmark.events import Event, kind_of, seconds, shown, when
-from kalmark.logs.json_lines import LONGEST_LINE, event_of, mapping_of
+from kalmark.events import Event, kind_of, label_of_event, seconds_text, short_text
+from kalmark.logs.json_lines import LONGEST_LINE, event_of_object, mapping_of
 from kalmark.report import Report
 from kalmark.slam.slam import Slam
 
@@ -57,7 +57,7 @@ class Live:
             given = mapping_of(line)
             if given == {"type": "map"}:
                 return head | {"landmarks": self.landmarks()}
-            event = event_of(given)
+            event = event_of_object(given)
             with self.changing:
                 return head | self.estimate(event, self.process(event))
         except KalmarkError as error:
@@ -71,13 +71,13 @@ class Live:
         Raises EventError or DivergedError.
         """
         if self.slam.has_taken(event):
-            whose = " by ".join(shown(name) for name in kind_of(event)[1:] if name)
-            raise EventError(f"{when(event)}: a second one of {whose} at this time, expected each event once")
+            whose = " by ".join(short_text(name) for name in kind_of(event)[1:] if name)
+            raise EventError(f"{label_of_event(event)}: a second one of {whose} at this time, expected each event once")
         return self.slam.process(event)
 
     def estimate(self, event: Event, report: Report) -> dict[str, Any]:
         """Return the robot's mean and covariance after an event, and what became of its observations."""
-        out: dict[str, Any] = {"t_ns": event.t_ns, "t_s": float(seconds(event.t_ns)), "robot": event.robot}
+        out: dict[str, Any] = {"t_ns": event.t_ns, "t_s": float(seconds_text(event.t_ns)), "robot": event.robot}
         out |= {"mean": self.slam.mean(event.robot).tolist(), "covariance": self.slam.covariance(event.robot).tolist()}
         if report.observations:
             seen = (o._asdict() for o in report.observations)
@@ -139,7 +139,7 @@ class Incoming:
             self.came += piece
             if self.stranger and (first := self.came.lstrip()[:1]):
                 if first != b"{":
-                    text = shown(self.came.decode("utf-8", "replace").splitlines()[0])
+                    text = short_text(self.came.decode("utf-8", "replace").splitlines()[0])
                     raise EndedError(f"{text} is no object of JSON, expected events as docs/live.md has them")
                 self.stranger = False
             if not piece:

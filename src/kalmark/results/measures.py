@@ -56,7 +56,7 @@ class Rigid(NamedTuple):
         return np.column_stack([self(poses[:, :2]), poses[:, 2] + angle])
 
 
-def identity(d: int = 2) -> Rigid:
+def identity_alignment(d: int = 2) -> Rigid:
     """Return the alignment in `d` dimensions that changes nothing."""
     return Rigid(np.eye(d), np.zeros(d))
 
@@ -69,7 +69,7 @@ def rigid(source: Array, target: Array, weights: Array | None = None) -> Rigid:
     d = source.shape[1]
     w = np.ones(len(source)) if weights is None else weights
     if len(source) == 0 or w.sum() <= 0:
-        return identity(d)
+        return identity_alignment(d)
     mean_s, mean_t = w @ source / w.sum(), w @ target / w.sum()
     cross = (target - mean_t).T @ ((source - mean_s) * w[:, None])
     u, _, vt = np.linalg.svd(cross)
@@ -138,7 +138,7 @@ def path_m(positions: Array) -> float:
 
 
 @compiled
-def in_log(turn: float, x: float, y: float) -> tuple[float, float]:
+def log_translation(turn: float, x: float, y: float) -> tuple[float, float]:
     """Return V(turn)^-1 (x, y) in the plane."""
     p, q = exponential_v(turn)
     square = p * p + q * q
@@ -151,7 +151,7 @@ def all_in_log(turn: Array, d: Array) -> Array:
     out = np.empty_like(d)
     for i in range(len(d)):
         if d.shape[1] == 2:
-            out[i, 0], out[i, 1] = in_log(turn[i, 0], d[i, 0], d[i, 1])
+            out[i, 0], out[i, 1] = log_translation(turn[i, 0], d[i, 0], d[i, 1])
         else:
             inverse = left_jacobian_inverse(turn[i])
             for j in range(3):
@@ -172,10 +172,10 @@ def rotations_between(mean: Array, truth: Array) -> Array:
 
 def rotation_error(mean: Array, truth: Array) -> Array:
     """Return Log(Q_truth Q_mean') (..., 3), at most pi long, for unit quaternions (..., 4)."""
-    return rotations_between(rows(mean), rows(truth)).reshape(*np.shape(mean)[:-1], 3)
+    return rotations_between(contiguous_rows(mean), contiguous_rows(truth)).reshape(*np.shape(mean)[:-1], 3)
 
 
-def rows(values: Any, shape: tuple[int, ...] | None = None) -> Array:
+def contiguous_rows(values: Any, shape: tuple[int, ...] | None = None) -> Array:
     """Return values (..., n), broadcast to a shape if one is given, as contiguous rows (N, n)."""
     values = np.asarray(values, dtype=np.float64)
     values = values if shape is None else np.broadcast_to(values, shape)
@@ -194,7 +194,7 @@ def point_error(mean: Array, truth: Array, dtheta: Any, coordinates: str) -> Arr
     if coordinates != "log":
         raise ValueError(f"coordinates is {coordinates!r}, expected 'world' or 'log'")
     turn = np.asarray(dtheta) if d.shape[-1] == 3 else np.asarray(dtheta)[..., None]
-    return all_in_log(rows(turn, (*d.shape[:-1], turn.shape[-1])), rows(d)).reshape(d.shape)
+    return all_in_log(contiguous_rows(turn, (*d.shape[:-1], turn.shape[-1])), contiguous_rows(d)).reshape(d.shape)
 
 
 def pose_error(mean: Array, truth: Array, coordinates: str = "world") -> Array:
@@ -268,7 +268,7 @@ def nees(d: Array, P: Array) -> Array:
     Singular: a variance that is not positive, or tr C^-1 above 1e12, C being the correlation matrix.
     """
     P = np.ascontiguousarray(P, dtype=np.float64)
-    return all_nees(rows(d, P.shape[:-1])[:, None], P.reshape(-1, *P.shape[-2:])).reshape(P.shape[:-2])
+    return all_nees(contiguous_rows(d, P.shape[:-1])[:, None], P.reshape(-1, *P.shape[-2:])).reshape(P.shape[:-2])
 
 
 @compiled
@@ -294,12 +294,12 @@ def map_nees(d: Array, P: Array, first: Index, sizes: Index) -> Array:
     return out
 
 
-def most_nees(d: Array, P: Array) -> float:
+def nees_limit(d: Array, P: Array) -> float:
     """Return what the mean NEES of errors d (N, n), covariances P (N, n, n), one after the other, may be in a good run.
 
     They are worth N / (1 + 2 sum (1 - k / N) |C_k|^2 / n) independent ones, one at least: C_k (n, n) is the correlation
     of errors in their sigmas over k steps, up to the first of which the trace is not positive.  The mean is below
-    in a share `CONSISTENT` of runs, and `most_nees` never below what one value is in a share `ALONE`, because the
+    in a share `CONSISTENT` of runs, and `nees_limit` never below what one value is in a share `ALONE`, because the
     correlation is that of this run, and changes along it.  NaN where every P is singular.
     """
     known = np.isfinite(nees(d, P))
@@ -329,7 +329,7 @@ def nis(z: Array, Z: Array) -> tuple[Array, Ints]:
     return value, np.where(np.isfinite(value), dof, 0)
 
 
-def cut_off(gate: float, dof: int) -> float:
+def truncated_variance(gate: float, dof: int) -> float:
     """Return the variance of whitened innovations of `dof` numbers of which a gate on d2 leaves out the rest.
 
     That of a Gaussian without what is farther than the gate: F(dof + 2) / F(dof), F of chi-square at the gate.
@@ -343,7 +343,7 @@ def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tu
     return float(quantile(tail, dof * runs)) / runs, float(quantile(1.0 - tail, dof * runs)) / runs
 
 
-def diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:
+def has_diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:
     """Return whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
 
     `d` (N, 2 or 3) is the position error in the estimator's coordinates, `P` its covariance, `error_m` (N,) its

@@ -24,7 +24,7 @@ from kalmark.files import replace_file
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.landmark_table import LINES, TAG
 from kalmark.results.recording import Recording
-from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, broken, contours, joined, squares
+from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, break_path, contours, join_polylines, squares
 from kalmark.results.verdict_text import alarm
 
 VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "front": (0.0, 0.0)}
@@ -95,7 +95,7 @@ def draw_map(
     spans = [(scene.high - scene.low)[:2]]
     if scene.d == 3:
         projection = Projection.of(scene, view)
-        spans.insert(0, np.ptp(projection(corners(scene.low, scene.high)), axis=0))
+        spans.insert(0, np.ptp(projection(box_corners(scene.low, scene.high)), axis=0))
     aspects = [float(np.clip(span[0] / span[1], 0.5, 4.0)) for span in spans]
     tall = float(np.clip(INCHES[scene.d] / sum(aspects), 3.0, 8.5))
     width = max(sum(aspects) * tall + 0.2 + 0.65 * len(spans), 6.0)
@@ -164,7 +164,9 @@ def strokes(scene: Scene) -> list[Stroke]:
         out.append(Stroke(scene.bridges(robot), style | {"linestyle": ":"}))
     truth = {"color": TRUTH_COLOUR, "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
     label = f"true path{'s' if several else ''}{scene.how}"
-    out += [Stroke(broken(scene.truth[robot], scene.stretches[robot]), truth, label, truth) for robot in scene.truth]
+    out += [
+        Stroke(break_path(scene.truth[robot], scene.stretches[robot]), truth, label, truth) for robot in scene.truth
+    ]
     small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
     aligned = "position fixes (aligned, not used)"
     out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
@@ -184,7 +186,7 @@ def strokes(scene: Scene) -> list[Stroke]:
     for robot, path in scene.dead.items():
         dead = {"color": scene.colour(robot), "linewidth": 0.7, "alpha": 0.5, "linestyle": (0, (5, 3)), "zorder": 3}
         if np.isfinite(path).any():
-            out.append(Stroke(broken(path, scene.stretches[robot]), dead, "dead reckoning", dead))
+            out.append(Stroke(break_path(path, scene.stretches[robot]), dead, "dead reckoning", dead))
     return out
 
 
@@ -197,10 +199,12 @@ def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[St
         out.append(Stroke(np.array(points), plus, f"true landmarks{scene.how}", _marks("+", colour, 7, 1)))
     if lines:
         out.append(
-            Stroke(joined(lines, scene.d), style, f"true {'walls' if scene.d == 2 else 'lines'}{scene.how}", style)
+            Stroke(
+                join_polylines(lines, scene.d), style, f"true {'walls' if scene.d == 2 else 'lines'}{scene.how}", style
+            )
         )
     tags = np.array([l for l in scene.true_landmarks.values() if len(l) == TAG]).reshape(-1, TAG)
-    return [*out, Stroke(joined(squares(tags, scene.size)), style)] if len(tags) else out
+    return [*out, Stroke(join_polylines(squares(tags, scene.size)), style)] if len(tags) else out
 
 
 def _known_strokes(scene: Scene) -> list[Stroke]:
@@ -222,13 +226,18 @@ def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
         thin = {"linewidth": 0.5 * width, "alpha": 0.75 * alpha} if crowded else {"linewidth": width, "alpha": alpha}
         sample = {"color": colour, "marker": "."}
         out.append(
-            Stroke(joined(rings, scene.d), {"color": colour, "zorder": 4, **thin}, label.format(scene.of_what), sample)
+            Stroke(
+                join_polylines(rings, scene.d),
+                {"color": colour, "zorder": 4, **thin},
+                label.format(scene.of_what),
+                sample,
+            )
         )
         out.append(Stroke(shapes.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
     if len(shapes.lines):
-        out.append(Stroke(joined(shapes.lines, scene.d), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
+        out.append(Stroke(join_polylines(shapes.lines, scene.d), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
     if scene.d == 3:
-        tags = joined(squares(shapes.tags, scene.size))
+        tags = join_polylines(squares(shapes.tags, scene.size))
         out.append(Stroke(tags, {"color": EUCLIDEAN_COLOUR, "linewidth": 1.4, "zorder": 5}))
     return out
 
@@ -246,12 +255,12 @@ def _robot_strokes(scene: Scene) -> list[Stroke]:
         marker, size = (_arrow(float(path[-1, 2])), 15) if d == 2 else ("o", 6)
         mark = _marks(_arrow(0.0) if d == 2 else "o", INK, 11 if d == 2 else 6, 1)
         ends.append(Stroke(path[-1:, :d], _marks(marker, colour, size, 8) | {"markeredgecolor": "white"}, "end", mark))
-        ring = joined(contours(path[-1:, :d], scene.pose_covariances[robot][-1:])[0], d)
+        ring = join_polylines(contours(path[-1:, :d], scene.pose_covariances[robot][-1:])[0], d)
         style = {"color": colour if d == 2 else POSE_COLOUR, "linewidth": 0.9, "zorder": 7}
         rings.append(Stroke(ring, style, f"end, 3σ {scene.of_what}", style | {"color": INK if d == 2 else POSE_COLOUR}))
         if d == 3:
             thin = {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}
-            rings.append(Stroke(joined(scene.frames(robot)), thin))
+            rings.append(Stroke(join_polylines(scene.frames(robot)), thin))
     return starts + ends + rings
 
 
@@ -303,7 +312,7 @@ class Projection:
         return q[..., :2] / (1.0 - q[..., 2:] / self.distance)
 
 
-def corners(low: Array, high: Array) -> Array:
+def box_corners(low: Array, high: Array) -> Array:
     """Return the corners (8, 3) of a box."""
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
@@ -317,21 +326,21 @@ def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
     if len(scene.ids) <= CROWD:
         standing = scene.shapes.means[scene.shapes.group != LINES]
         shadows += [np.array([point, [*point[:2], floor]]) for point in standing]
-    drawn = [Stroke(scene.inside(joined(shadows)), {"color": SHADOW, "linewidth": 0.7, "zorder": 1})]
+    drawn = [Stroke(scene.inside(join_polylines(shadows)), {"color": SHADOW, "linewidth": 0.7, "zorder": 1})]
     drawn += [Stroke(scene.inside(stroke.points), stroke.style) for stroke in strokes(scene)]
     for points, style, *_ in _ground(axes, scene, projection) + drawn:
         axes.plot(*projection(points).T, clip_on=False, **style)
     for name, point in _labels(scene):
         u, v = projection(point + np.array([0.0, 0.0, 0.012 * scene.size]))
         axes.text(u, v, name, **NAMED)
-    edges = projection(corners(scene.low, scene.high))
+    edges = projection(box_corners(scene.low, scene.high))
     low, high = edges.min(axis=0), edges.max(axis=0)
     pad = 0.04 * (high - low).max()
     axes.set_xlim(low[0] - pad, high[0] + pad)
     axes.set_ylim(low[1] - pad, high[1] + pad)
 
 
-def spacing(size: float) -> float:
+def grid_spacing(size: float) -> float:
     """Return the distance of the lines of a grid: 2 m, or 1, 2 or 5 times a power of ten that gives some ten lines."""
     if 8.0 <= size <= 40.0:
         return 2.0
@@ -342,7 +351,7 @@ def spacing(size: float) -> float:
 def _ground(axes: Axes, scene: Scene, projection: Projection) -> list[Stroke]:
     """Return the grid on the ground and a scale of heights at a corner; draw ticks at the edges that face the eye."""
     low, high, eye, z = scene.low, scene.high, projection.axes[2], scene.ground
-    step = spacing(float((high - low)[:2].max()))
+    step = grid_spacing(float((high - low)[:2].max()))
     xs, ys = (np.arange(np.ceil(low[i] / step), np.floor(high[i] / step) + 1) * step for i in (0, 1))
     lines = [np.array([[x, low[1], z], [x, high[1], z]]) for x in xs]
     lines += [np.array([[low[0], y, z], [high[0], y, z]]) for y in ys]
@@ -359,7 +368,7 @@ def _ground(axes: Axes, scene: Scene, projection: Projection) -> list[Stroke]:
     for text, point in ticks:
         u, v = projection(np.array(point))
         axes.text(u, v, text, color=TICK, fontsize=8, ha="center", va="center", zorder=1)
-    return [Stroke(joined(lines), {"color": GROUND, "linewidth": 0.7, "zorder": 0}), *heights]
+    return [Stroke(join_polylines(lines), {"color": GROUND, "linewidth": 0.7, "zorder": 0}), *heights]
 
 
 def _heights(scene: Scene, projection: Projection) -> tuple[list[Stroke], list[tuple[str, Any]]]:
@@ -367,9 +376,9 @@ def _heights(scene: Scene, projection: Projection) -> tuple[list[Stroke], list[t
     low, high = scene.low, scene.high
     if abs(projection.axes[2, 2]) > 0.99:
         return [], []
-    edges = corners(low, high)
+    edges = box_corners(low, high)
     x, y, _ = edges[np.argmin(projection(edges)[:, 0])]
-    step = spacing(float(3.0 * max(high[2] - low[2], 0.2 * scene.size)))
+    step = grid_spacing(float(3.0 * max(high[2] - low[2], 0.2 * scene.size)))
     scale = Stroke(np.array([[x, y, low[2]], [x, y, high[2]]]), {"color": "#b4bac4", "linewidth": 0.8, "zorder": 0})
     beside = -0.03 * scene.size * projection.axes[0]
     zs = np.arange(np.ceil(low[2] / step), np.floor(high[2] / step) + 1) * step

@@ -43,7 +43,7 @@ def axes_of(sensor: Measuring) -> tuple[Axis, Axis] | None:
     return across, ahead
 
 
-def measuring(history: History) -> list[Measuring]:
+def sensors_with_picture(history: History) -> list[Measuring]:
     """Return the sensors of a run that have such a picture."""
     return [sensor for sensor in history.sensors if axes_of(sensor) is not None]
 

@@ -20,9 +20,9 @@ from kalmark.results.camera_images import Pictures
 from kalmark.results.explain import Explanation, Fate
 from kalmark.results.figure_texts import figure as figure_of
 from kalmark.results.history import Camera, Measuring
-from kalmark.results.plot_measured import draw_measured, measuring
+from kalmark.results.plot_measured import draw_measured, sensors_with_picture
 from kalmark.results.recording import Recording
-from kalmark.results.scene import INK, Image, Sighting, colour_of, contours, images, joined, steps_of, trimmed
+from kalmark.results.scene import INK, Image, Sighting, clip_line, colour_of, contours, images, join_polylines, steps_of
 
 OUTCOME = {
     "associated": "#4a8f7b", "new": "#d2a23c", "rejected": "#c8553d", "ignored": "#8b929c",
@@ -58,7 +58,7 @@ def draw_scan(run: Recording, told: Explanation) -> Figure:
     inside = ((kept.means[:, :2] > low) & (kept.means[:, :2] < high)).all(axis=1)
     means = kept.means[inside, :2]
     axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
-    axes.plot(*joined(contours(means, kept.shape[inside, :2, :2])[:, 0], 2).T, color=FAINT, lw=0.8)
+    axes.plot(*join_polylines(contours(means, kept.shape[inside, :2, :2])[:, 0], 2).T, color=FAINT, lw=0.8)
     _observations(axes, told, low, high)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -180,7 +180,7 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     sensor or scan.
     """
     history = run.history
-    drawable: list[Camera | Measuring] = [*history.cameras, *measuring(history)]
+    drawable: list[Camera | Measuring] = [*history.cameras, *sensors_with_picture(history)]
     sensors = {(s.robot, s.sensor): s for s in drawable}
     if (robot, sensor) not in sensors:
         names = ", ".join(map(".".join, sensors)) or "none"
@@ -264,7 +264,7 @@ def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: s
         if rejected:
             axes.plot(*np.vstack([s.measured, s.expected]).T, ":", color=INK, linewidth=0.8, zorder=4)
     elif len(s.expected) == 2:
-        line = trimmed(s.expected[0], s.expected[1], size)
+        line = clip_line(s.expected[0], s.expected[1], size)
         if line is not None:
             axes.plot(*line.T, **style)
     else:

@@ -16,10 +16,18 @@ from kalmark.errors import DivergedError, EventError, ImageError, LogError
 from kalmark.events import Control, Event, Fix, Frame, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.progress import track
-from kalmark.logs.source import nearest
+from kalmark.logs.source import spelling_hint
 from kalmark.report import Report
-from kalmark.results.control_gaps import joined
-from kalmark.results.filter_description import biases, cameras, configuration, left_px, mounts, sensors, stated_noise
+from kalmark.results.control_gaps import merge_gaps
+from kalmark.results.filter_description import (
+    biases,
+    calibrated_mounts,
+    cameras,
+    configuration,
+    residual_px,
+    sensors,
+    stated_noise,
+)
 from kalmark.results.history import (
     Controlled,
     History,
@@ -29,16 +37,16 @@ from kalmark.results.history import (
     RelocatedRobot,
     RobotStart,
     UsedFix,
-    padded,
+    pad_blocks,
     texts,
 )
 from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.recording import KNOWN, LogReference
-from kalmark.results.repeated_landmarks import repeated
+from kalmark.results.repeated_landmarks import repeat_rows
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
 from kalmark.results.unmeasured import Foresight
-from kalmark.slam.description import plain
+from kalmark.slam.description import plain_value
 from kalmark.slam.held_control import HeldInput
 
 if TYPE_CHECKING:
@@ -214,7 +222,7 @@ class _Recorder:
         ]
         self.kinds += ["" if model is None else model.kind for model in models]
         if report.observations:
-            self.left.append(left_px(self.slam, scan, report))
+            self.left.append(residual_px(self.slam, scan, report))
         due = self.due < len(self.snapshot_at) and len(self.reports) > self.snapshot_at[self.due]
         grown = self.pictures and self.kept < SMALL and any(o.outcome == "new" for o in report.observations)
         if due or grown:
@@ -246,7 +254,7 @@ class _Recorder:
             stopped=self.stopped,
             slam=slam,
             source=log,
-            reference=plain(log.reference),
+            reference=plain_value(log.reference),
             known="" if config is not None else self.known,
         )
 
@@ -264,9 +272,9 @@ class _Recorder:
         return History(
             t_ns=np.array([r.t_ns for r in reports], dtype=np.int64),
             robot=texts([r.robot for r in reports]),
-            mean=padded([mean[None] for mean, _ in self.states], ones, n),
-            covariance=padded([P[None] for _, P in self.states], ones, q, matrices=True),
-            dead_reckoned=padded([r[None] for r in self.dead], ones, n),
+            mean=pad_blocks([mean[None] for mean, _ in self.states], ones, n),
+            covariance=pad_blocks([P[None] for _, P in self.states], ones, q, matrices=True),
+            dead_reckoned=pad_blocks([r[None] for r in self.dead], ones, n),
             step_us=np.array(self.step_ns, dtype=np.float64) * 1e-3,
             step=np.array([s for s, _, _ in rows], dtype=np.int64),
             sensor=texts([scan.sensor for _, scan, _ in rows]),
@@ -276,17 +284,17 @@ class _Recorder:
             landmark=texts([o.landmark for o in seen]),
             d2=np.array([np.nan if o.d2 is None else o.d2 for o in seen], dtype=np.float64),
             reason=texts([o.reason for o in seen]),
-            y=padded([r.y for r in reports], counts, m),
-            e=padded([r.e for r in reports], counts, m),
-            z=padded([r.z for r in reports], counts, p),
-            Z=padded([r.Z for r in reports], counts, p, matrices=True),
+            y=pad_blocks([r.y for r in reports], counts, m),
+            e=pad_blocks([r.e for r in reports], counts, m),
+            z=pad_blocks([r.z for r in reports], counts, p),
+            Z=pad_blocks([r.Z for r in reports], counts, p, matrices=True),
             kind=texts(list(self.kinds)),
             left_px=np.concatenate(self.left),
             true_id=texts([None if (ids := known[s]) is None else ids[o.index] for s, _, o in rows]),
             late=np.array(
                 [(scan.t_ns, scan.robot, scan.sensor, o.index) in late for _, scan, o in rows], dtype=np.bool_
             ),
-            noise=padded([stated_noise(self.slam, r) for r in reports], counts, p),
+            noise=pad_blocks([stated_noise(self.slam, r) for r in reports], counts, p),
             maps=tuple(self.maps),
             controls={name: of._replace(number=round(of.number)) for name, of in self.controls.items()},
             fixes=tuple(self.fixes),
@@ -294,11 +302,11 @@ class _Recorder:
             priors=self.priors,
             cameras=cameras(self.slam),
             sensors=sensors(self.slam),
-            mounts=mounts(self.slam),
+            mounts=calibrated_mounts(self.slam),
             biases=biases(self.slam),
             placed=tuple(self.placed),
-            gaps=joined(self.gaps),
-            repeats=repeated(self.slam),
+            gaps=merge_gaps(self.gaps),
+            repeats=repeat_rows(self.slam),
             stepped=self.stepped_by,
             **decisions(reports, 3 if any(space.world == "space" for space in spaces) else 2),
             **self.foresight.columns(m, p),
@@ -330,7 +338,7 @@ def decisions(reports: list[Report], d: int) -> dict[str, Any]:
         "candidate_landmark": texts([c.landmark for _, c in seen]),
         "candidate_d2": np.array([c.d2 for _, c in seen], dtype=np.float64),
         "candidate_place": np.array([c.place for _, c in seen], dtype=np.float64).reshape(-1, d),
-        "seen_at": padded([report.seen_at for report in reports], counts, d),
+        "seen_at": pad_blocks([report.seen_at for report in reports], counts, d),
         "changes": tuple(changes),
         "share_row": np.array([row for row, _, _ in shares], dtype=np.int64),
         "share_landmark": texts([name for _, name, _ in shares]),
@@ -357,7 +365,7 @@ def refuse_other_columns(slam: Slam, log: Log) -> None:
         columns = tuple(model.columns)
         if is_own(type(model)) and registered_name(type(model)) and tuple(given) != columns:
             missing = [name for name in columns if name not in given]
-            hint = next(filter(None, (nearest(name, missing) for name in given if name not in columns)), "")
+            hint = next(filter(None, (spelling_hint(name, missing) for name in given if name not in columns)), "")
             place = log.places.get((robot, sensor))
             where = f"{place[0]}:1" if place is not None else log.path or "log"
             wanted = f"{', '.join(columns)} of its {type(model).__name__}"

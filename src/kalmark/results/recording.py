@@ -26,14 +26,14 @@ from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
-from kalmark.events import listed, shown
-from kalmark.files import locked, read_arrays, refuse_aliases, replace_file, write
+from kalmark.events import list_names, short_text
+from kalmark.files import hold_lock, read_arrays, refuse_aliases, replace_file, write
 from kalmark.logs.poses import tum_text
-from kalmark.logs.source import LeftOut, records_of, seconds
+from kalmark.logs.source import LeftOut, records_of, seconds_text
 from kalmark.results.history import History
 from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.truth import Truth
-from kalmark.slam.description import plain
+from kalmark.slam.description import plain_value
 
 if TYPE_CHECKING:
     from kalmark.logs.log import Log
@@ -59,7 +59,7 @@ def associations_csv(history: History) -> str:
     Of an observation that was averaged over landmarks, one row each with its weight, which is then a column more.
     """
     steps, landmarks = history.step.tolist(), history.landmark.tolist()
-    times, robots = [seconds(t_ns) for t_ns in history.t_ns.tolist()], history.robot.tolist()
+    times, robots = [seconds_text(t_ns) for t_ns in history.t_ns.tolist()], history.robot.tolist()
     seen = (column.tolist() for column in (history.sensor, history.index, history.id, history.outcome))
     d2 = ["" if math.isnan(value) else value for value in history.d2.tolist()]  # the writer writes floats by repr
     columns: list[Sequence[Any]] = [[times[s] for s in steps], [robots[s] for s in steps], *seen, landmarks, d2]
@@ -80,7 +80,7 @@ def associations_csv(history: History) -> str:
 def changes_csv(history: History) -> str:
     """Return one row for each landmark that was removed or merged with another: after which scan, and why."""
     rows = [
-        [seconds(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
+        [seconds_text(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
         for c in history.changes
     ]
     return _csv(CHANGES, rows)
@@ -113,7 +113,7 @@ def config_yaml(config: dict[str, Any]) -> str:
     yaml = YAML()
     yaml.default_flow_style = False
     yaml.representer.add_representer(type(None), lambda to, _: to.represent_scalar("tag:yaml.org,2002:null", "null"))
-    yaml.dump(plain(head | {key: value for key, value in config.items() if key not in head}), out)
+    yaml.dump(plain_value(head | {key: value for key, value in config.items() if key not in head}), out)
     return out.getvalue()
 
 
@@ -182,7 +182,7 @@ class Recording:
     def __repr__(self) -> str:
         steps, lost = len(self.history.t_ns), f", stopped: {self.stopped}" if self.stopped else ""
         of = f"{steps} steps, {len(self.history.outcome)} observations, {len(self.landmarks)} landmarks"
-        return f"<{type(self).__name__} {self.log.name!r} of {listed(self.history.robots)}: {of}{lost}>"
+        return f"<{type(self).__name__} {self.log.name!r} of {list_names(self.history.robots)}: {of}{lost}>"
 
     @property
     def estimator(self) -> str:
@@ -232,8 +232,8 @@ class Recording:
         """
         if self.config.get("plugins") and not self.trusted:
             raise RunError(
-                f"{self.folder}/config.yaml names plug-ins, {shown(self.config['plugins'])}, whose code would be run: "
-                "expected --trust, or Run.load(folder, trust=True), if you trust them"
+                f"{self.folder}/config.yaml names plug-ins, {short_text(self.config['plugins'])}, "
+                "whose code would be run: expected --trust, or Run.load(folder, trust=True), if you trust them"
             )
         for plugin in self.config.get("plugins") or ():
             load_plugin(Path(plugin))
@@ -249,7 +249,7 @@ class Recording:
             if not (folder / name).is_file():
                 raise RunError(f"{folder / name}: no such file, expected the folder of a complete run")
         try:
-            with locked(folder, shared=True):  # no other program replaces it meanwhile
+            with hold_lock(folder, shared=True):  # no other program replaces it meanwhile
                 summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
                 named = read_arrays(folder / "history.npz", RunError)
                 log = summary["log"]

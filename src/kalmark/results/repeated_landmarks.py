@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kalmark.management.repeated_places import IN_A_REPEAT, repeats
+from kalmark.management.repeated_places import IN_A_REPEAT, find_repeats
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.history import History, Repeated
 from kalmark.results.recording import Recording
@@ -19,11 +19,11 @@ NAMED = 3  # pairs that a warning names
 SOME = 3  # landmarks of a part
 
 
-def repeated(slam: Slam) -> tuple[Repeated, ...]:
+def repeat_rows(slam: Slam) -> tuple[Repeated, ...]:
     """Return the repeats in a filter's map, a row a pair."""
     return tuple(
         Repeated(number, str(a), str(b), each.shift, float(each.T[2]), each.score, each.p)
-        for number, each in enumerate(repeats(slam.map, slam.tracks))
+        for number, each in enumerate(find_repeats(slam.map, slam.tracks))
         for a, b in each.pairs
     )
 

@@ -21,7 +21,7 @@ from kalmark.arrays import Array
 from kalmark.report import OUTCOMES
 from kalmark.results.camera_images import Pictures
 from kalmark.results.evaluate import headline, summary_of
-from kalmark.results.explain import Explanation, Fate, explained
+from kalmark.results.explain import Explanation, Fate, explain_step
 from kalmark.results.figure_texts import (
     BATCH,
     DIFFERENCE_COLUMNS,
@@ -29,9 +29,9 @@ from kalmark.results.figure_texts import (
     MORE,
     ROBOT,
     TOTALS,
+    column_header,
     difference_rows,
-    header,
-    in_words,
+    rows_with_labels,
 )
 from kalmark.results.history import Camera, History, Ints, LandmarkChange, MapSnapshot
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
@@ -40,16 +40,16 @@ from kalmark.results.scene import (
     POINTS,
     Scene,
     Sighting,
-    broken,
+    break_path,
     colour_of,
-    drawn_map,
-    grouped,
+    group_steps,
     images,
-    joined,
+    join_polylines,
+    map_shapes,
+    spread_indices,
     squares,
     steps_of,
     stretches_of,
-    thin,
 )
 from kalmark.results.self_calibration import MOUNT_COLUMNS, mount_rows
 from kalmark.results.verdict_text import overall, verdict_lines
@@ -103,7 +103,7 @@ def report_html(run: Recording, world: bool = False) -> str:
         advice=_items(notes),
         mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS)
         + _section(DIFFERENCE_TITLE, difference_rows(summary), DIFFERENCE_COLUMNS),
-        reasons=_table(reasons(run), ("outcome", "reason", "observations")),
+        reasons=_table(common_reasons(run), ("outcome", "reason", "observations")),
         changes=_section("Landmarks merged and removed", [*change_rows(run)], ("t (s)", "landmark", "", "why")),
         skipped=_skipped(run, summary),
         config=html.escape(config_yaml(run.config)),
@@ -119,8 +119,8 @@ def robot_table(summary: dict[str, Any]) -> str:
     """Return the table of the figures of each robot."""
     robots = summary["robots"]
     columns = [row for row in _ROBOT if any(row[0] in figures for figures in robots.values())]
-    rows = [(name, *(show(f.get(key), unit) for key, _, unit in columns)) for name, f in robots.items()]
-    return _table(rows, ("robot", *(header(label, unit) for _, label, unit in columns)))
+    rows = [(name, *(figure_text(f.get(key), unit) for key, _, unit in columns)) for name, f in robots.items()]
+    return _table(rows, ("robot", *(column_header(label, unit) for _, label, unit in columns)))
 
 
 def summary_table(summary: dict[str, Any]) -> str:
@@ -131,13 +131,13 @@ def summary_table(summary: dict[str, Any]) -> str:
     words += [(f"{name}.{key}", f"{name}: {label}", unit) for name in others for key, label, unit in ROBOT]
     rows = "".join(
         f'<tr title="{html.escape(key)}"><td{" class=part" if label.startswith(" ") else ""}>'
-        f"{html.escape(label.strip())}</td><td>{html.escape(show(value, unit))}</td><td>{unit}</td></tr>"
-        for key, label, value, unit in in_words(figures, tuple(words))
+        f"{html.escape(label.strip())}</td><td>{html.escape(figure_text(value, unit))}</td><td>{unit}</td></tr>"
+        for key, label, value, unit in rows_with_labels(figures, tuple(words))
     )
     return f"<table>{rows}</table>"
 
 
-def show(value: Any, unit: str = "") -> str:
+def figure_text(value: Any, unit: str = "") -> str:
     """Return a figure as it is printed: four significant digits, a dash for what is not there; a share in per cent."""
     if value is None:
         return "–"  # noqa: RUF001 - a dash
@@ -147,7 +147,7 @@ def show(value: Any, unit: str = "") -> str:
         value = 100.0 * value if unit == "%" else value
         return f"{value:,.4g}" if 1e-3 <= abs(value) < 1e5 or value == 0 else f"{value:.3e}"
     if isinstance(value, list):
-        return ", ".join(show(item, unit) for item in value)
+        return ", ".join(figure_text(item, unit) for item in value)
     return str(value)
 
 
@@ -192,18 +192,18 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
     maps = maps[::-1][::stride][::-1]  # the last among them
     true = scene.true_points()
     return {
-        "box": {"low": rounded(scene.low, 3), "high": rounded(scene.high, 3)},
+        "box": {"low": round_values(scene.low, 3), "high": round_values(scene.high, 3)},
         "ellipses": scene.of_what,
         "how": scene.how,
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
         "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
         "knownLandmarks": {"id": [str(i) for i in scene.known_ids], **xy(scene.known)},
         "unseenLandmarks": xy(scene.unseen),
-        "trueLines": xy(joined(scene.true_lines(), scene.d)),
-        "fixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.fixes.items()},
+        "trueLines": xy(join_polylines(scene.true_lines(), scene.d)),
+        "fixes": {robot: xy(points[spread_indices(len(points))]) for robot, points in scene.fixes.items()},
         "repeats": xy(scene.repeats),
-        "usedFixes": {robot: xy(points[thin(len(points))]) for robot, points in scene.used.items()},
-        "bodies": {robot: xy(joined(scene.body(robot))) for robot in scene.paths if scene.d == 3},
+        "usedFixes": {robot: xy(points[spread_indices(len(points))]) for robot, points in scene.used.items()},
+        "bodies": {robot: xy(join_polylines(scene.body(robot))) for robot in scene.paths if scene.d == 3},
         "cameras": [_camera(run, camera, maps, t, pictures) for camera in run.history.cameras],
         "robots": [_robot(run, scene, robot, t) for robot in scene.paths],
         "innovations": _innovations(run, scene),
@@ -217,10 +217,10 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
 
 def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
     """Return a map: all points, the endpoints of lines last, with the group that each is drawn in."""
-    drawn = drawn_map(m, scene.d, scene.world)
-    lines = {"lines": xy(joined(drawn.lines, scene.d))}
+    drawn = map_shapes(m, scene.d, scene.world)
+    lines = {"lines": xy(join_polylines(drawn.lines, scene.d))}
     head = {"t": round(t_s, 3), "id": [str(m.ids[row]) for row in drawn.row], "group": drawn.group.tolist()}
-    tags = {"tags": xy(joined(squares(drawn.tags, scene.size)))} if scene.d == 3 else {}
+    tags = {"tags": xy(join_polylines(squares(drawn.tags, scene.size)))} if scene.d == 3 else {}
     return {**head, "count": len(m.ids), **lines, **tags, **gaussians(drawn.means, drawn.covariances)}
 
 
@@ -246,34 +246,38 @@ def _camera(
 
 def _seen(s: Sighting) -> dict[str, Any]:
     colour, meaning = colour_of(s)
-    out: dict[str, Any] = {"name": s.name, "outcome": s.outcome, "y": [rounded(p, 2) for p in s.measured]}
+    out: dict[str, Any] = {"name": s.name, "outcome": s.outcome, "y": [round_values(p, 2) for p in s.measured]}
     if np.isfinite(s.expected).all():
-        out |= {"e": [rounded(p, 2) for p in s.expected], "colour": colour, "meaning": meaning}
+        out |= {"e": [round_values(p, 2) for p in s.expected], "colour": colour, "meaning": meaning}
     if np.isfinite(s.Z).all():
-        out["Z"] = rounded(np.array([s.Z[0, 0], s.Z[0, 1], s.Z[1, 1]]), 3)
+        out["Z"] = round_values(np.array([s.Z[0, 0], s.Z[0, 1], s.Z[1, 1]]), 3)
     return out
 
 
 def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]:
     rows = np.flatnonzero(run.history.robot == robot)
-    rows = rows[thin(len(rows))]
-    mean, P = run.history.poses[rows], scene.pose_covariances[robot][thin(len(scene.paths[robot]))]
-    out: dict[str, Any] = {"name": robot, "colour": scene.colour(robot), "t": significant(t[rows], 7)}
+    rows = rows[spread_indices(len(rows))]
+    mean, P = run.history.poses[rows], scene.pose_covariances[robot][spread_indices(len(scene.paths[robot]))]
+    out: dict[str, Any] = {"name": robot, "colour": scene.colour(robot), "t": round_significant(t[rows], 7)}
     d = scene.d
     out |= gaussians(mean[:, :d], P)
-    stretches = scene.stretches[robot][thin(len(scene.stretches[robot]))]
+    stretches = scene.stretches[robot][spread_indices(len(scene.stretches[robot]))]
     out["gaps"] = _gaps(stretches)
-    out["dotted"] = _gaps(np.cumsum(scene.dotted[robot], dtype=np.int64)[thin(len(scene.dotted[robot]))])
-    out |= {"theta": significant(mean[:, 2], 5)} if d == 2 else {"q": [significant(q, 5) for q in mean[:, 3:].T]}
+    out["dotted"] = _gaps(np.cumsum(scene.dotted[robot], dtype=np.int64)[spread_indices(len(scene.dotted[robot]))])
+    out |= (
+        {"theta": round_significant(mean[:, 2], 5)}
+        if d == 2
+        else {"q": [round_significant(q, 5) for q in mean[:, 3:].T]}
+    )
     dead = scene.dead[robot]
     if np.isfinite(dead).any():
-        out["dead"] = xy(broken(dead[thin(len(dead))], stretches))
+        out["dead"] = xy(break_path(dead[spread_indices(len(dead))], stretches))
     if robot in scene.truth:
         true = scene.truth[robot]
-        out["truth"] = xy(broken(true[thin(len(true))], stretches))
+        out["truth"] = xy(break_path(true[spread_indices(len(true))], stretches))
         out |= _errors(run, rows)
     else:
-        out["sigma"] = [significant(column) for column in _sigmas(run, rows).T]
+        out["sigma"] = [round_significant(column) for column in _sigmas(run, rows).T]
     return out
 
 
@@ -293,9 +297,9 @@ def _errors(run: Recording, rows: Ints) -> dict[str, Any]:
     scale = np.repeat([1.0, 180.0 / np.pi], [metres, turns])
     error = -pose_error(mean, truth) * scale
     return {
-        "error": [significant(column) for column in error.T],
-        "sigma": [significant(column) for column in _sigmas(run, rows).T],
-        "nees": significant(nees(pose_error(mean, truth, run.coordinates), P)),
+        "error": [round_significant(column) for column in error.T],
+        "sigma": [round_significant(column) for column in _sigmas(run, rows).T],
+        "nees": round_significant(nees(pose_error(mean, truth, run.coordinates), P)),
     }
 
 
@@ -306,15 +310,15 @@ def _nis(run: Recording, t: Array) -> dict[str, Any]:
     value, dof = nis(history.z[used], history.Z[used])
     steps, at = np.unique(history.step[used][dof > 0], return_inverse=True)
     window = max(1, -(-len(t) // (POINTS // 4)))
-    groups, gaps = grouped(steps, history.t_ns[steps], window)
+    groups, gaps = group_steps(steps, history.t_ns[steps], window)
     total = np.bincount(groups[at], value[dof > 0])
     degrees = np.bincount(groups[at], dof[dof > 0]).astype(int)
     bounds = {n: anees_interval(n) for n in np.unique(degrees).tolist()}
     return {
-        "t": significant(np.bincount(groups, t[steps]) / np.bincount(groups), 7),
-        "value": significant(total / degrees),
-        "low": significant(np.array([bounds[n][0] / n for n in degrees.tolist()])),
-        "high": significant(np.array([bounds[n][1] / n for n in degrees.tolist()])),
+        "t": round_significant(np.bincount(groups, t[steps]) / np.bincount(groups), 7),
+        "value": round_significant(total / degrees),
+        "low": round_significant(np.array([bounds[n][0] / n for n in degrees.tolist()])),
+        "high": round_significant(np.array([bounds[n][1] / n for n in degrees.tolist()])),
         "gaps": gaps.tolist(),
         "window": window,
     }
@@ -327,7 +331,7 @@ def _outcomes(run: Recording, t: Array) -> dict[str, Any]:
     when = t[history.step]
     counts = {name: np.histogram(when[history.outcome == name], edges)[0].tolist() for name in OUTCOMES}
     return {
-        "t": significant((edges[:-1] + edges[1:]) / 2, 7),
+        "t": round_significant((edges[:-1] + edges[1:]) / 2, 7),
         "counts": {name: column for name, column in counts.items() if any(column)},
     }
 
@@ -342,11 +346,11 @@ def _innovations(run: Recording, scene: Scene) -> list[dict[str, Any]]:
         t_ns, used = np.array([fix.t_ns for fix in fixes]), np.array([fix.used for fix in fixes])
         t, z = (t_ns - begin_ns) * 1e-9, np.array([fix.z for fix in fixes])
         sigma = np.sqrt(np.maximum([np.diagonal(fix.Z) for fix in fixes], 0.0))
-        rows, bad = thin(len(fixes)), np.flatnonzero(~used)
-        bad = bad[thin(len(bad))]
-        curves = {key: [significant(c) for c in x[rows].T] for key, x in (("z", z), ("sigma", sigma))}
-        rejected = {"t": significant(t[bad], 7), "z": [significant(column) for column in z[bad].T]}
-        head = {"name": robot, "colour": scene.colour(robot), "t": significant(t[rows], 7)}
+        rows, bad = spread_indices(len(fixes)), np.flatnonzero(~used)
+        bad = bad[spread_indices(len(bad))]
+        curves = {key: [round_significant(c) for c in x[rows].T] for key, x in (("z", z), ("sigma", sigma))}
+        rejected = {"t": round_significant(t[bad], 7), "z": [round_significant(column) for column in z[bad].T]}
+        head = {"name": robot, "colour": scene.colour(robot), "t": round_significant(t[rows], 7)}
         out.append({**head, **curves, "gaps": _gaps(stretches_of(t_ns)[rows]), "rejected": rejected})
     return out
 
@@ -356,7 +360,7 @@ def _gaps(stretches: Ints) -> list[int]:
     return (np.flatnonzero(np.diff(stretches)) + 1).tolist()
 
 
-def reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
+def common_reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
     """Return the commonest (outcome, reason, count); of too many, those that differ in a number only count as one."""
     pairs = zip(run.history.outcome.tolist(), run.history.reason.tolist(), strict=True)
     counts = Counter((outcome, reason) for outcome, reason in pairs if reason)
@@ -372,9 +376,9 @@ def _association(run: Recording, t: Array, world: bool) -> dict[str, Any]:
     """Return ambiguous scans in the order of time, and when landmarks were merged or removed."""
     changes = _told_changes(run.history)
     return {
-        "scans": [_ambiguous(run.history, explained(run, step), world) for step in ambiguous(run.history).tolist()],
+        "scans": [_ambiguous(run.history, explain_step(run, step), world) for step in ambiguous(run.history).tolist()],
         "changes": {
-            what: significant(np.array([t[c.step] for c in changes if c.what == what][:MARKS]), 7)
+            what: round_significant(np.array([t[c.step] for c in changes if c.what == what][:MARKS]), 7)
             for what in dict.fromkeys(c.what for c in changes)
         },
     }
@@ -415,9 +419,10 @@ def _ambiguous(history: History, told: Explanation, world: bool) -> dict[str, An
 
 
 def _fate(fate: Fate) -> dict[str, Any]:
-    x, y = rounded(fate.seen_at[:2], 4)
+    x, y = round_values(fate.seen_at[:2], 4)
     near = [
-        {"name": str(c.landmark), "d2": float(f"{c.d2:.3g}")} | dict(zip("xy", rounded(c.place[:2], 4), strict=True))
+        {"name": str(c.landmark), "d2": float(f"{c.d2:.3g}")}
+        | dict(zip("xy", round_values(c.place[:2], 4), strict=True))
         for c in fate.near
     ]
     text = f"{fate.outcome}{' ' + fate.landmark if fate.landmark else ''}{': ' if fate.reason else ''}{fate.reason}"
@@ -428,20 +433,20 @@ def _fate(fate: Fate) -> dict[str, Any]:
 
 def xy(points: Array) -> dict[str, Any]:
     """Return points (N, 2 or 3) to a tenth of a millimetre."""
-    return {axis: rounded(column, 4) for axis, column in zip("xyz", points.T, strict=False)}
+    return {axis: round_values(column, 4) for axis, column in zip("xyz", points.T, strict=False)}
 
 
 def gaussians(means: Array, covariances: Array) -> dict[str, Any]:
     """Return means (N, d) and covariances (N, d, d) column by column: x, y, pxx, pxy, pyy, in space more."""
     pairs = combinations_with_replacement(range(means.shape[1]), 2)
-    return xy(means) | {f"p{'xyz'[i]}{'xyz'[j]}": significant(covariances[:, i, j]) for i, j in pairs}
+    return xy(means) | {f"p{'xyz'[i]}{'xyz'[j]}": round_significant(covariances[:, i, j]) for i, j in pairs}
 
 
-def rounded(values: Array, digits: int) -> list[float | None]:
+def round_values(values: Array, digits: int) -> list[float | None]:
     """Return values to so many decimals, None for NaN and infinity."""
     return [value if math.isfinite(value) else None for value in np.round(values, digits).tolist()]
 
 
-def significant(values: Array, digits: int = 4) -> list[float | None]:
+def round_significant(values: Array, digits: int = 4) -> list[float | None]:
     """Return values to so many significant digits, None for NaN and infinity."""
     return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in values.tolist()]

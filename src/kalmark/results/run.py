@@ -59,14 +59,14 @@ class Run(Recording):
         Maps have the ellipses of the shape or those in the `world`.
         """
         from kalmark.results.plot import save_figure, save_map  # matplotlib is slow to import
-        from kalmark.results.plot_measured import measuring
+        from kalmark.results.plot_measured import sensors_with_picture
         from kalmark.results.plot_scan import draw_sensor
         from kalmark.results.report import report_html
 
         folder = Path(folder)
         save_map(self, folder / "map.png", world)
         written = [folder / "map.png", folder / "report.html"]
-        drawable: list[Camera | Measuring] = [*self.history.cameras, *measuring(self.history)]
+        drawable: list[Camera | Measuring] = [*self.history.cameras, *sensors_with_picture(self.history)]
         for seen in (sensor for sensor in drawable if len(steps_of(self.history, sensor))):
             written.append(folder / f"sensor_{file_name(seen.robot)}_{file_name(seen.sensor)}.png")
             save_figure(draw_sensor(self, seen.robot, seen.sensor), written[-1], dpi=110, rim=False)

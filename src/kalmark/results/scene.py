@@ -27,7 +27,7 @@ from kalmark.results.history import Camera, History, Ints, MapSnapshot, Measurin
 from kalmark.results.landmark_table import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
 from kalmark.results.measures import rigid
 from kalmark.results.recording import Recording
-from kalmark.results.truth import as_rigid, moved
+from kalmark.results.truth import as_rigid, move_landmarks
 
 COLUMN = re.compile(r"([uv])([lr]?)(\d*)_px")
 EXPECTED = {  # colours and their meaning, by whether the landmark is Euclidean, then whether it was used
@@ -99,23 +99,23 @@ class Scene:
         aligned = bool(known.any()) and not (run.truth.frame == "truth" and (world or run.truth.anchored))
         to_map = run.truth.to_map()
         if aligned:
-            some = np.flatnonzero(known)[thin(int(known.sum()))]
+            some = np.flatnonzero(known)[spread_indices(int(known.sum()))]
             to_map = rigid(_corners(run.truth.poses[some]), _corners(history.poses[some]))
         mine = {robot: history.robot == robot for robot in history.robots}
         truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
         scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
         truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
         landmarks = {
-            i: l if d == 3 or len(l) == 2 * d else l[:2] for i, l in moved(to_map, run.truth.landmarks).items()
+            i: l if d == 3 or len(l) == 2 * d else l[:2] for i, l in move_landmarks(to_map, run.truth.landmarks).items()
         }
         used, (last, exact) = _used_fixes(run, d), run.landmarks.split()
         end = history.map_at(len(history.t_ns))
         as_kept = not world and end.ids == tuple(last.ids)
-        whole = drawn_map(end, d, world) if as_kept else shapes(*last.places(), last.kinds, d)
+        whole = map_shapes(end, d, world) if as_kept else shapes(*last.places(), last.kinds, d)
         now, ids = whole, tuple(last.ids)
         if step is not None:
             kept = history.map_at(step)
-            now, ids = drawn_map(kept, d, world), kept.ids
+            now, ids = map_shapes(kept, d, world), kept.ids
         until = slice(None) if step is None else slice(step + 1)
         poses, P = history.poses, history.pose_covariances[:, :d, :d]
         P = P if world else history.robot_shape(np.arange(len(P)))
@@ -146,7 +146,7 @@ class Scene:
         unseen = np.array([at[str(i)][:d] for i in last.ids if i in last.unseen and str(i) in at]).reshape(-1, d)
         return cls(
             d, paths, covariances, stretches, dotted, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
-            joined([line[:, :d] for line in twice], d), unseen, known_at, tuple(exact.ids),
+            join_polylines([line[:, :d] for line in twice], d), unseen, known_at, tuple(exact.ids),
             world, aligned,
         )  # fmt: skip
 
@@ -177,14 +177,14 @@ class Scene:
 
     def line(self, robot: str) -> Array:
         """Return a robot's path (N, d), NaN where its way is unknown."""
-        return broken(self.paths[robot][:, : self.d], np.cumsum(self.dotted[robot]))
+        return break_path(self.paths[robot][:, : self.d], np.cumsum(self.dotted[robot]))
 
     def bridges(self, robot: str) -> Array:
         """Return the rest of a robot's path (N, d): across gaps of time and while it is lost, NaN between them."""
         path = self.paths[robot][:, : self.d]
         ends = np.diff(self.dotted[robot][: len(path)].astype(int), prepend=0, append=0)
         spans = zip(np.flatnonzero(ends > 0).tolist(), np.flatnonzero(ends < 0).tolist(), strict=True)
-        return joined([path[max(first - 1, 0) : last] for first, last in spans], self.d)
+        return join_polylines([path[max(first - 1, 0) : last] for first, last in spans], self.d)
 
     def inside(self, lines: Array) -> Array:
         """Return polylines (..., d) with NaN where they leave the box."""
@@ -216,7 +216,7 @@ class Scene:
         return {i: l[: self.d] for i, l in self.true_landmarks.items() if len(l) != 2 * self.d}
 
 
-def drawn_map(kept: MapSnapshot, d: int, world: bool) -> Shapes:
+def map_shapes(kept: MapSnapshot, d: int, world: bool) -> Shapes:
     """Return what is drawn of a map that was kept, with the covariances of its shape or in the world."""
     return shapes(kept.means, kept.covariances if world else kept.shape, kept.kinds, d)
 
@@ -247,7 +247,7 @@ def _known(means: Array, covariances: Array) -> Flags:
     return np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
 
 
-def joined(lines: Sequence[Array] | Array, d: int = 3) -> Array:
+def join_polylines(lines: Sequence[Array] | Array, d: int = 3) -> Array:
     """Return polylines (P, d) as one (N, d) that is broken by NaN between them."""
     parts = [part for line in lines for part in (line, np.full((1, d), np.nan))]
     return np.concatenate(parts) if parts else np.empty((0, d))
@@ -261,20 +261,20 @@ def stretches_of(t_ns: Ints) -> Ints:
     return np.append(0, np.cumsum(steps > max(FIX_GAP_S, GAP_STEPS * float(np.median(steps)))))
 
 
-def broken(points: Array, stretches: Ints) -> Array:
+def break_path(points: Array, stretches: Ints) -> Array:
     """Return a path (N, d) with a row of NaN before each new stretch, so that no line is drawn across the gap."""
     at = np.flatnonzero(np.diff(stretches[: len(points)])) + 1
     return np.insert(points, at, np.nan, axis=0)
 
 
-def thin(count: int) -> Ints:
+def spread_indices(count: int) -> Ints:
     """Return at most about 2,000 evenly spread indices, the last one among them."""
     stride = max(1, -(-count // POINTS))
     indices = np.arange(0, count, stride)
     return np.append(indices, count - 1) if count and indices[-1] != count - 1 else indices
 
 
-def grouped(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
+def group_steps(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
     """Return the group (N,) of each of these steps, and before which groups a gap in time is.
 
     A group is drawn as one: what is of so many consecutive steps, and on one side of a gap.
@@ -401,7 +401,7 @@ def _points(camera: Camera) -> dict[str, Ints]:
     }
 
 
-def trimmed(a: Array, b: Array, size: tuple[float, float]) -> Array | None:
+def clip_line(a: Array, b: Array, size: tuple[float, float]) -> Array | None:
     """Return the part (2, 2) of the straight line through two pixels that lies in an image, None if there is none."""
     d = b - a
     if not (np.isfinite(d).all() and d.any()):

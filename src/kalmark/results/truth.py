@@ -47,7 +47,7 @@ class Truth:
         for robot, trajectory in log.truth.items():
             mine = history.robot == robot
             if mine.any():
-                poses[mine] = fitted(trajectory.at(history.t_ns[mine]), size)
+                poses[mine] = poses_of_size(trajectory.at(history.t_ns[mine]), size)
         offset = ORIGIN[size] if anchored else _offset(log.truth, _known(history, poses), size)
         landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in log.landmarks.items()}
         if size == 7:
@@ -72,7 +72,7 @@ class Truth:
 
     def landmarks_in_map(self) -> dict[Id, Array]:
         """Return the true landmarks in the frame of the map."""
-        return moved(self.to_map(), self.landmarks)
+        return move_landmarks(self.to_map(), self.landmarks)
 
     def arrays(self) -> Arrays:
         """Return everything as named arrays for ``history.npz``."""
@@ -107,7 +107,7 @@ class Truth:
         return cls(named["truth"], landmarks, fixes, named["truth_offset"], bool(named["truth_anchored"]), robots)
 
 
-def fitted(poses: Array, size: int) -> Array:
+def poses_of_size(poses: Array, size: int) -> Array:
     """Return poses (N, 3) or (N, 7) as poses of the plane (size 3: seen from above) or of space (size 7: at z = 0)."""
     if poses.shape[1] == size:
         return poses
@@ -127,7 +127,7 @@ def as_rigid(pose: Array) -> Rigid:
     return Rigid(np.array([[c, -s], [s, c]]), pose[:2])
 
 
-def moved(rigid: Rigid, landmarks: Mapping[Id, Array]) -> dict[Id, Array]:
+def move_landmarks(rigid: Rigid, landmarks: Mapping[Id, Array]) -> dict[Id, Array]:
     """Return landmarks rotated and shifted: positions (attributes are kept), endpoints (4|6,), in space poses (7,)."""
     d = len(rigid.shift)
     out = {}
@@ -157,7 +157,7 @@ def _offset(trajectories: Mapping[str, Any], starts: Sequence[RobotStart], size:
     for start in starts:
         if start.robot not in trajectories:
             continue
-        true = fitted(trajectories[start.robot].at(np.array([start.t_ns])), size)[0]
+        true = poses_of_size(trajectories[start.robot].at(np.array([start.t_ns])), size)[0]
         if not np.isfinite(true).all():
             continue
         n = 2 if size == 3 else 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from kalmark.results.checked import OK, UNCHECKED, worst
+from kalmark.results.checked import OK, UNCHECKED, worst_status
 from kalmark.results.figure_texts import count, figure
 
 SHOWN = 3  # causes in a short verdict
@@ -37,7 +37,7 @@ def alarm(verdict: Mapping[str, Any] | None) -> list[str]:
 
 def overall(verdict: Mapping[str, Any]) -> str:
     """Return the worst status of a map and of the paths of its robots."""
-    return worst(verdict["map"], *verdict.get("robots", {}).values())
+    return worst_status(verdict["map"], *verdict.get("robots", {}).values())
 
 
 def _first(verdict: Mapping[str, Any]) -> str:

@@ -33,7 +33,7 @@ from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
 from kalmark.results.control_gaps import gap_warnings
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix
-from kalmark.results.measures import cut_off, nis
+from kalmark.results.measures import nis, truncated_variance
 from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_warnings
 from kalmark.results.restarts import restarts
@@ -318,7 +318,7 @@ def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"{int(turns.sum())} bearings beyond 2 pi rad: are they in degrees?"
 
 
-def budgeted(history: History) -> Flags:
+def left_out_by_attention(history: History) -> Flags:
     """Return which observations (O,) an attention left out: that contradicts nothing."""
     return np.logical_or.reduce([np.char.startswith(history.reason, start) for start in ATTENTION])
 
@@ -326,7 +326,7 @@ def budgeted(history: History) -> Flags:
 def _unused(run: Recording) -> Iterator[str]:
     """Yield warnings of sensors most of whose observations could not be used, and of none of a known landmark."""
     history, robots = run.history, run.history.robot[run.history.step]
-    by_design = budgeted(history) | (history.reason == AGAIN)
+    by_design = left_out_by_attention(history) | (history.reason == AGAIN)
     pairs = sorted(set(zip(robots.tolist(), history.sensor.tolist(), strict=True)))
     for robot, sensor in pairs:
         own = (robots == robot) & (history.sensor == sensor)
@@ -462,7 +462,7 @@ def _d2(fix: UsedFix) -> float:
     return float(fix.z @ np.linalg.solve(fix.Z, fix.z))
 
 
-def too_sure(figures: Mapping[str, Any]) -> bool:
+def is_overconfident(figures: Mapping[str, Any]) -> bool:
     """Return whether the truth shows a robot's pose to be off by more than its covariance."""
     value, most = figures.get("pose_nees"), figures.get("pose_nees_most")
     return value is not None and most is not None and value > most
@@ -472,7 +472,7 @@ def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     dof = summary["pose_dof"]
     for name, figures in summary["robots"].items():
         value = figures.get("pose_nees")
-        if too_sure(figures):
+        if is_overconfident(figures):
             whose = f" of {name}" if len(summary["robots"]) > 1 else ""
             yield (
                 f"pose NEES{whose} {figure(value)} where {dof} is consistent, and at most "
@@ -486,7 +486,7 @@ def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
 
 def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
     history = run.history
-    if summary["diverged"] or any(map(too_sure, summary["robots"].values())):
+    if summary["diverged"] or any(map(is_overconfident, summary["robots"].values())):
         return
     for sensor in dict.fromkeys(history.sensor.tolist()):
         mine = (history.outcome == "associated") & (history.sensor == sensor) & np.isfinite(history.noise).any(axis=1)
@@ -511,8 +511,8 @@ def _cut_off(run: Recording, sections: list[dict[str, Any]], dof: int) -> float:
     own = next((section["association"] for section in sections if section.get("association")), None)
     share = (own or run.config.get("association") or {}).get("gate")
     if share == "default" and (run.config.get("estimator") or {}).get("type") == "ekf":
-        return cut_off(Ekf.default_gate, dof)
-    return cut_off(gate(share, dof), dof) if isinstance(share, float) else 1.0
+        return truncated_variance(Ekf.default_gate, dof)
+    return truncated_variance(gate(share, dof), dof) if isinstance(share, float) else 1.0
 
 
 def _compared(history: History, sensor: str, mine: Any, columns: tuple[str, ...], left: float) -> Iterator[str]:

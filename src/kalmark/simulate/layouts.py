@@ -17,7 +17,7 @@ from numpy.random import Generator
 from pydantic import AfterValidator, Field, model_validator
 
 from kalmark.arrays import Array
-from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, expected
+from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, unexpected_value
 from kalmark.geometry.frames3d import from_euler_pose, from_frame
 from kalmark.simulate.rendering import Rectangle, texture
 
@@ -33,10 +33,10 @@ Triple = Annotated[tuple[Number, Number, Number], Field(strict=False)]
 
 def _some(points: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
     if not points:
-        raise expected("at least one point [x, y]")
+        raise unexpected_value("at least one point [x, y]")
     sizes = {len(point) for point in points}
     if len(sizes) > 1 or not sizes <= {2, 3}:
-        raise expected("points [x, y], or all of them [x, y, z]")
+        raise unexpected_value("points [x, y], or all of them [x, y, z]")
     return points
 
 
@@ -94,7 +94,7 @@ class WallLayout(OfPoints):
     @model_validator(mode="after")
     def _has_room(self) -> WallLayout:
         if self.x_max_m <= self.x_min_m or self.y_max_m <= self.y_min_m:
-            raise expected("x_max_m above x_min_m and y_max_m above y_min_m")
+            raise unexpected_value("x_max_m above x_min_m and y_max_m above y_min_m")
         return self
 
     def floor(self) -> Array:
@@ -139,7 +139,7 @@ class Loop(OfPoints):
     @model_validator(mode="after")
     def _is_outside_the_centre(self) -> Loop:
         if self.radius_spread_m > self.radius_m:
-            raise expected(f"radius_spread_m at most radius_m, {self.radius_m:g}")
+            raise unexpected_value(f"radius_spread_m at most radius_m, {self.radius_m:g}")
         return self
 
     def place(self, rng: Generator) -> Array:
@@ -225,7 +225,7 @@ class RandomBox(OfPoints):
     @model_validator(mode="after")
     def _has_room(self) -> RandomBox:
         if not all(low <= high for low, high in zip(self.min_m, self.max_m, strict=True)):
-            raise expected("max_m nowhere below min_m")
+            raise unexpected_value("max_m nowhere below min_m")
         return self
 
     def place(self, rng: Generator) -> Array:
@@ -233,7 +233,7 @@ class RandomBox(OfPoints):
         return rng.uniform(self.min_m, self.max_m, (self.count, 3))
 
 
-def before_wall(
+def pose_at_wall(
     size: tuple[float, float], wall: int, off_m: float, along: float, z: float, turned: float = 0.0
 ) -> Array:  # fmt: skip
     """Return the pose (7,) of a tag or picture on a wall of a room: 0 the western, 1 northern, 2 eastern, 3 southern.
@@ -268,11 +268,11 @@ class TagRoom(Section):
         """Return the tags (4 per_wall heights, 7), always the same."""
         across = (2 * np.arange(1, self.per_wall + 1) / (self.per_wall + 1) - 1).tolist()
         size = self.length_m, self.width_m
-        tags = [before_wall(size, wall, 0.0, y, z) for wall in range(4) for z, y in product(self.heights_m, across)]
+        tags = [pose_at_wall(size, wall, 0.0, y, z) for wall in range(4) for z, y in product(self.heights_m, across)]
         return Scenery(tags=np.array(tags), tag_sizes=np.full(len(tags), self.size_m))
 
 
-def corners(walls: Array) -> Array:
+def wall_corners(walls: Array) -> Array:
     """Return where walls (S, 4) meet (N, 2): where an end of one is on another that has another direction."""
     found: list[Array] = []
     a, u = walls[:, :2], walls[:, 2:] - walls[:, :2]
@@ -332,13 +332,13 @@ class Listed(Section):
     @model_validator(mode="after")
     def _has_something(self) -> Listed:
         if not (self.points_m or self.segments_m or self.tags or self.walls_m):
-            raise expected("points_m, segments_m, tags or walls_m")
+            raise unexpected_value("points_m, segments_m, tags or walls_m")
         if self.walls_m and (self.segments_m or self.tags or (self.points_m and len(self.points_m[0]) == 3)):
-            raise expected("walls_m without anything of space")
+            raise unexpected_value("walls_m without anything of space")
         if any(wall[:2] == wall[2:] for wall in self.walls_m):
-            raise expected("walls_m with two ends each")
+            raise unexpected_value("walls_m with two ends each")
         if self.points_m and len(self.points_m[0]) == 2 and (self.segments_m or self.tags):
-            raise expected("points [x, y, z] beside segments or tags")
+            raise unexpected_value("points [x, y, z] beside segments or tags")
         return self
 
     def scenery(self, rng: Generator) -> Scenery:
@@ -346,7 +346,7 @@ class Listed(Section):
         points = np.array(self.points_m, dtype=np.float64) if self.points_m else np.empty((0, 3))
         if self.walls_m:
             walls = np.array(self.walls_m, dtype=np.float64)
-            return Scenery(np.concatenate([points.reshape(-1, 2), corners(walls)]), walls)
+            return Scenery(np.concatenate([points.reshape(-1, 2), wall_corners(walls)]), walls)
         segments = np.array(self.segments_m, dtype=np.float64).reshape(-1, 6)
         tags = np.array([tag.pose() for tag in self.tags]).reshape(-1, 7)
         return Scenery(points, segments, tags, np.array([tag.size_m for tag in self.tags]))
@@ -427,12 +427,12 @@ class TexturedRoom(_Textured):
         size, top = (self.length_m, self.width_m), self.height_m
         floor = from_euler_pose(np.array([size[0] / 2, size[1] / 2, 0.0, math.pi, 0.0, 0.0]))[0]
         planes = [(floor, *size)]
-        planes += [(before_wall(size, wall, 0.0, 0.0, top / 2), size[1 - wall % 2], top) for wall in range(4)]
+        planes += [(pose_at_wall(size, wall, 0.0, 0.0, top / 2), size[1 - wall % 2], top) for wall in range(4)]
         for wall in rng.integers(0, 4, self.panels).tolist():
             width, height = rng.uniform(*PANEL_M, 2).tolist()
             z = rng.uniform(height / 2, max(height, top - height / 2))
             off, y, turned = rng.uniform((0.3, -0.8, -0.6), (1.0, 0.8, 0.6)).tolist()
-            planes.append((before_wall(size, wall, self.panel_depth_m * off, y, z, turned), width, height))
+            planes.append((pose_at_wall(size, wall, self.panel_depth_m * off, y, z, turned), width, height))
         return self.textured(planes, rng)
 
 

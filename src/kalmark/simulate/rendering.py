@@ -83,7 +83,7 @@ class Renderer:
 
         The depth is infinite where there is no plane.
         """
-        image, depth = sampled(self.rays, self.seen_from(T), self.sizes, self.levels, self.texels, self.focal_px)
+        image, depth = sample_planes(self.rays, self.seen_from(T), self.sizes, self.levels, self.texels, self.focal_px)
         return image.reshape(self.shape), depth.reshape(self.shape)
 
     def seen_from(self, T: Array) -> Array:
@@ -109,7 +109,7 @@ class Renderer:
         return np.clip(np.rint(image), 0, 255).astype(np.uint8), depth
 
 
-def rendered(renderer: Renderer, T: Array, seed: int, noise: float, blur_px: float) -> Bytes:
+def render(renderer: Renderer, T: Array, seed: int, noise: float, blur_px: float) -> Bytes:
     """Return the image (H, W) from the camera's pose T (7,), its noise by a seed."""
     return renderer.taken(T, np.random.default_rng(seed), noise, blur_px)[0]
 
@@ -137,7 +137,7 @@ def pyramid(texture: Bytes) -> list[Bytes]:
 
 
 @compiled
-def sampled(
+def sample_planes(
     rays: Array, planes: Array, sizes: Array, levels: Any, texels: Any, focal_px: float
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return grey values (N,) and depths (N,) along unit rays (N, 3) of the camera.

@@ -21,13 +21,13 @@ from numpy.random import Generator, SeedSequence
 from kalmark.arrays import Array
 from kalmark.config.building import build_robot
 from kalmark.detect.laser_scan import RAW, Laser
-from kalmark.events import Control, Event, Frame, Id, Scan, order, seconds
+from kalmark.events import Control, Event, Frame, Id, Scan, seconds_text, sort_key
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import landmark_id
-from kalmark.models.observe import composed
+from kalmark.models.observe import sensor_pose
 from kalmark.models.protocols import (
     POSE,
     Drifting,
@@ -35,12 +35,12 @@ from kalmark.models.protocols import (
     Ranging,
     SeesVelocity,
     TimedNoise,
-    calibrating,
     coasts,
     diffusion_of,
     parameter_covariance,
     poses_kept,
     range_limit,
+    self_calibrating,
     tells_velocity,
     true_control,
 )
@@ -50,9 +50,9 @@ from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
 from kalmark.simulate.layouts import Scenery
-from kalmark.simulate.rendering import Rectangle, Renderer, rendered, rendered_depth
+from kalmark.simulate.rendering import Rectangle, Renderer, render, rendered_depth
 from kalmark.simulate.routes import Driver
-from kalmark.simulate.sights import POINTS, Sighted, SimulatedSensing, Things, gaussian, in_frame
+from kalmark.simulate.sights import POINTS, Sighted, SimulatedSensing, Things, gaussian, things_in_frame
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
 
@@ -148,19 +148,19 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
     origins: dict[Key, tuple[Id | None, ...]] = {}
     for robot in robots:
         if coasts(robot.motion) and robot.sensors:  # it moves from the first event on: the start
-            events.append(begun(robot, next(iter(robot.sensors)), chance))
+            events.append(first_event(robot, next(iter(robot.sensors)), chance))
     for k, (before, now) in enumerate(pairwise(times), 1):
         for robot in robots:
-            u = step(robot, world, chance.control)
+            u = step_robot(robot, world, chance.control)
             events.append(Control(t_ns=before if robot.motion.held else now, robot=robot.name, u=u))
         for robot in robots:
-            for scan, real in scans(robot, robots, things, world, k, now, chance):
+            for scan, real in sensor_scans(robot, robots, things, world, k, now, chance):
                 events.append(scan)
                 origins[now, scan.robot, scan.sensor] = real
-            events += frames(robot, k, now, chance)
+            events += camera_frames(robot, k, now, chance)
     states = {r.name: np.array([*r.states, r.state]) for r in robots}
     log = Log(
-        world.name, tuple(world.robots), sorted(events, key=order), "simulated",
+        world.name, tuple(world.robots), sorted(events, key=sort_key), "simulated",
         truth={r.name: Trajectory(np.array(times), states[r.name][:, : len(r.pose)]) for r in robots},
         landmarks=true_landmarks(things),
         control_columns={r.name: r.motion.columns for r in robots},
@@ -208,27 +208,27 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance, planes: Sequ
     """
     simulated = world.robots[name]
     robot = build_robot(world.models(), name)
-    state = drawn_start(robot, chance.route)
+    state = draw_start(robot, chance.route)
     sensors = {}
     for key, mount in robot.sensors.items():
         sensing = simulated.sensing.get(key, SimulatedSensing()).of(simulated.sensors[key], world.dt_s)
         raw = mount.detector if isinstance(mount.detector, Laser) else None
-        true, at = drawn_mount(mount, chance.mounts)
+        true, at = draw_mount(mount, chance.mounts)
         sensors[key] = SimSensor(true, at, sensing, raw, Renderer(planes, true) if sensing.images else None)
     driver = simulated.route.driver(robot.motion, world.dt_s, area, chance.route)
-    model = calibrating(robot.motion)
+    model = self_calibrating(robot.motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
     return SimRobot(name, robot.motion, state, driver, sensors, constants=constants)
 
 
-def drawn_start(robot: Robot, rng: Generator) -> Array:
+def draw_start(robot: Robot, rng: Generator) -> Array:
     """Return the true start (3,) or (7 or more,) of a robot, drawn around the given one if that has sigmas."""
     space = robot.motion.space
     cov = np.zeros((space.dof, space.dof)) if robot.cov is None else robot.cov
     return space.plus(np.array(robot.start), gaussian(cov, rng))
 
 
-def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
+def draw_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
     """Return the true sensor and its true mount (3,) or (7,), drawn around the given ones if these have sigmas."""
     sensor: Any = mount.sensor
     at = np.array(mount.at)
@@ -243,7 +243,7 @@ def drawn_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
     return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0), at
 
 
-def step(robot: SimRobot, world: World, rng: Generator) -> Array:
+def step_robot(robot: SimRobot, world: World, rng: Generator) -> Array:
     """Move a robot by one step and return the control (m,) that its estimator is given."""
     motion, dt_s, u = robot.motion, world.dt_s, robot.driver(robot.state)
     error = gaussian(motion.control_noise(u), rng)
@@ -251,11 +251,11 @@ def step(robot: SimRobot, world: World, rng: Generator) -> Array:
     robot.states.append(robot.state)
     robot.u = done
     D = diffusion_of(motion, robot.state, done, dt_s)
-    robot.state = disturbed(motion, motion.move(robot.state, done, dt_s)[0], D, rng)
-    return told(motion, noisy, robot.constants, dt_s)
+    robot.state = disturb_state(motion, motion.move(robot.state, done, dt_s)[0], D, rng)
+    return given_control(motion, noisy, robot.constants, dt_s)
 
 
-def told(motion: Any, u: Array, constants: Array, dt_s: float) -> Array:
+def given_control(motion: Any, u: Array, constants: Array, dt_s: float) -> Array:
     """Return the control (m,) that is u (m,) in truth, with the constants (c,) by which all of a robot's are wrong."""
     out = u
     for _ in range(ROUNDS if len(constants) else 0):
@@ -263,12 +263,12 @@ def told(motion: Any, u: Array, constants: Array, dt_s: float) -> Array:
     return out
 
 
-def diffused(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -> Array:
+def add_diffusion(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -> Array:
     """Return a state (size,) disturbed by the diffusion of the motion, if any, in `dt_s` of the control u (m,)."""
-    return disturbed(motion, state, motion.diffusion(u, dt_s), rng)
+    return disturb_state(motion, state, motion.diffusion(u, dt_s), rng)
 
 
-def disturbed(motion: Any, state: Array, D: Array | None, rng: Generator) -> Array:
+def disturb_state(motion: Any, state: Array, D: Array | None, rng: Generator) -> Array:
     """Return a state (size,) disturbed by a diffusion D (k, k) in the robot's frame."""
     if D is None:
         return state
@@ -289,7 +289,7 @@ def body_axes(state: Array, size: int) -> Array:
     return G
 
 
-def scans(
+def sensor_scans(
     robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World, k: int, t_ns: int, chance: Chance
 ) -> list[tuple[Scan, tuple[Id | None, ...]]]:
     """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
@@ -300,7 +300,9 @@ def scans(
         if isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
             continue
         if carried.laser is not None:
-            y = laser.beams(carried.laser, carried.sensing, composed(robot.pose, carried.at)[0], things, chance.sight)
+            y = laser.beams(
+                carried.laser, carried.sensing, sensor_pose(robot.pose, carried.at)[0], things, chance.sight
+            )
             if len(y):
                 scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y)
                 found.append((scan, (None,) * len(y)))
@@ -317,11 +319,11 @@ def scans(
         others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
         t = np.zeros(0)
         if isinstance(sensor, SeesVelocity):  # of what stands still
-            t, others = moving_at(robot, carried, k, world.dt_s), {}
-        sighted = seen_by(sensor, composed(robot.pose, carried.at)[0], there, others, world, chance.sight, t)
-        sighted, real = sights.faulty(sensor, sighted, carried.sensing, k, there, chance.faults)
-        y = sights.noisy(sensor, sighted.e, chance.sight)
-        kept = sights.possible(sensor, y)
+            t, others = sensor_velocity(robot, carried, k, world.dt_s), {}
+        sighted = observe_things(sensor, sensor_pose(robot.pose, carried.at)[0], there, others, world, chance.sight, t)
+        sighted, real = sights.report_with_faults(sensor, sighted, carried.sensing, k, there, chance.faults)
+        y = sights.noisy_measurements(sensor, sighted.e, chance.sight)
+        kept = sights.is_reportable(sensor, y)
         if len(kept):
             ids = [sighted.ids[i] for i in kept] if world.ids else None
             scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=ids)
@@ -330,37 +332,37 @@ def scans(
     return found
 
 
-def frames(robot: SimRobot, k: int, t_ns: int, chance: Chance) -> list[Frame]:
+def camera_frames(robot: SimRobot, k: int, t_ns: int, chance: Chance) -> list[Frame]:
     """Return the frames of a robot's cameras that give images, from its true pose at step k."""
     return [
-        taken(robot, name, carried, carried.renderer, t_ns, chance)
+        take_frame(robot, name, carried, carried.renderer, t_ns, chance)
         for name, carried in robot.sensors.items()
         if carried.renderer is not None and carried.sensing.scans_at(k)
     ]
 
 
-def taken(robot: SimRobot, name: str, carried: SimSensor, renderer: Renderer, t_ns: int, chance: Chance) -> Frame:
+def take_frame(robot: SimRobot, name: str, carried: SimSensor, renderer: Renderer, t_ns: int, chance: Chance) -> Frame:
     """Return the frame of a camera from its robot's true pose, rendered when its pixels are needed."""
-    T, sensing, seed = composed(robot.pose, carried.at)[0], carried.sensing, int(chance.sight.integers(2**62))
-    image = partial(rendered, renderer, T, seed, sensing.noise_grey, sensing.blur_px)
+    T, sensing, seed = sensor_pose(robot.pose, carried.at)[0], carried.sensing, int(chance.sight.integers(2**62))
+    image = partial(render, renderer, T, seed, sensing.noise_grey, sensing.blur_px)
     sigma = carried.sensor.sigma_rho_per_m if isinstance(carried.sensor, PixelDepth) else 0.0
     depth = partial(rendered_depth, renderer, T, seed + 1, sigma) if sensing.depth else None
     right = None
     if isinstance(carried.sensor, Stereo):
-        beside = composed(T, np.array([carried.sensor.baseline_m, 0, 0, 0, 0, 0, 1.0]))[0]
-        right = partial(rendered, renderer, beside, seed + 2, sensing.noise_grey, sensing.blur_px)
+        beside = sensor_pose(T, np.array([carried.sensor.baseline_m, 0, 0, 0, 0, 0, 1.0]))[0]
+        right = partial(render, renderer, beside, seed + 2, sensing.noise_grey, sensing.blur_px)
     return Frame(t_ns=t_ns, robot=robot.name, sensor=name, image=image, depth=depth, right=right)
 
 
-def begun(robot: SimRobot, name: str, chance: Chance) -> Event:
+def first_event(robot: SimRobot, name: str, chance: Chance) -> Event:
     """Return the first event of a robot that moves without controls: an empty scan of a sensor, or its first image."""
     carried = robot.sensors[name]
     if carried.renderer is None:
         return Scan(t_ns=0, robot=robot.name, sensor=name)
-    return taken(robot, name, carried, carried.renderer, 0, chance)
+    return take_frame(robot, name, carried, carried.renderer, 0, chance)
 
 
-def moving_at(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:
+def sensor_velocity(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:
     """Return the velocity (2 or 3,) of a sensor at step k in its frame, or the mean since its last scan."""
     k_before, before = carried.last or (0, robot.states[0][: len(robot.pose)])
     state = robot.state if tells_velocity(robot.motion) else np.array(before)
@@ -380,14 +382,14 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
         of = carried.sensor = of.with_parameters(of.parameters + chance.sight.normal(0.0, np.sqrt(Q)))  # type: ignore[attr-defined]
     counts = of.views != POSE and not sees_state(of, robot.motion)
     v = view_of_state(of, robot.motion, at, robot.state, np.array(before), np.array([since_s, *robot.u]))
-    y, wild = measured(carried, v, since_s if counts else 0.0, chance)
+    y, wild = measure_state(carried, v, since_s if counts else 0.0, chance)
     if wild < (carried.sensing.dropouts or 0.0):
         carried.last = last if counts else carried.last
         return None
     return None if counts and last is None else y
 
 
-def measured(carried: SimSensor, v: Array, since_s: float, chance: Chance) -> tuple[Array, float]:
+def measure_state(carried: SimSensor, v: Array, since_s: float, chance: Chance) -> tuple[Array, float]:
     """Return what a sensor of the state measures of its view v (1, m), and a random number that may drop it."""
     of: Any = carried.sensor
     e, wild = of.expect(v[None])[0], chance.faults.uniform(size=2)
@@ -414,14 +416,17 @@ def with_loop(
         j = min(near, key=far.__getitem__)
         since = np.array([(k - j) * dt_s])
         v = view_of_state(of, robot.motion, carried.at, robot.state, carried.kept[j], since)
-        rows, ids = [*rows, *measured(carried, v, 0.0, chance)[0]], [*ids, landmark_id(seconds(round(j * dt_s * 1e9)))]
+        rows, ids = (
+            [*rows, *measure_state(carried, v, 0.0, chance)[0]],
+            [*ids, landmark_id(seconds_text(round(j * dt_s * 1e9)))],
+        )
     carried.kept[k], carried.last = robot.pose.copy(), (k, robot.pose.copy())
     for j in [*carried.kept][: -poses_kept(of)]:
         del carried.kept[j]
     return np.array(rows).reshape(len(rows), len(of.columns)), ids
 
 
-def seen_by(
+def observe_things(
     sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator, velocity: Array
 ) -> Sighted:  # fmt: skip
     """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last.
@@ -429,17 +434,17 @@ def seen_by(
     `velocity` is that of a sensor that measures it, in its frame, of others empty.
     """
     near = things.near(T[: world.dimensions], range_limit(sensor))
-    v = in_frame(things.sort, T, things.values[near])
+    v = things_in_frame(things.sort, T, things.values[near])
     v = np.column_stack([v, np.tile(velocity, (len(v), 1))])
-    inside, e = sights.exact(sensor, v, things.sizes[near])
+    inside, e = sights.exact_measurements(sensor, v, things.sizes[near])
     near, v, e = near[inside], v[inside], e[inside]
     distance = np.linalg.norm(sights.centre(things.sort, v, world.dimensions), axis=1)
-    rows = sights.chosen(things, near, distance, world.new_per_step, world.max_per_scan, rng)
+    rows = sights.select_reported(things, near, distance, world.new_per_step, world.max_per_scan, rng)
     ids: list[Id] = [int(i) + things.first for i in near[rows]]
     v, e, sizes = v[rows], e[rows], things.sizes[near[rows]]
     if others and things.sort == POINTS:
-        w = in_frame(POINTS, T, np.array([pose[: world.dimensions] for pose in others.values()]))
-        inside, f = sights.exact(sensor, w, np.zeros(len(w)))
+        w = things_in_frame(POINTS, T, np.array([pose[: world.dimensions] for pose in others.values()]))
+        inside, f = sights.exact_measurements(sensor, w, np.zeros(len(w)))
         v, e, sizes = np.concatenate([v, w[inside]]), np.concatenate([e, f[inside]]), np.append(sizes, 0 * f[inside, 0])
         ids += [name for name, seen in zip(others, inside, strict=True) if seen]
     return Sighted(v, e, sizes, ids)

@@ -143,10 +143,10 @@ def steer_in_plane(motion: Any, state: Array, target: Array, drive: Drive, dt_s:
         w = min(limit, max(-limit, error / max(dt_s, SLOW_S)))
         change = np.array([drive.speed_mps, 0.0, w]) - motion.body_velocity(state)[0]
         return change if len(columns) == 3 else change[[0, 2]]
-    return control(motion, drive.speed_mps, min(limit, max(-limit, error / dt_s)), dt_s)
+    return control_of_velocity(motion, drive.speed_mps, min(limit, max(-limit, error / dt_s)), dt_s)
 
 
-def control(motion: Any, v: float, w: float, dt_s: float) -> Array:
+def control_of_velocity(motion: Any, v: float, w: float, dt_s: float) -> Array:
     """Return the control (m,) of `motion` that drives at v (m/s) and turns at w (rad/s) for `dt_s`."""
     if isinstance(motion, Unicycle | SlippingUnicycle):
         return np.array([v, w])

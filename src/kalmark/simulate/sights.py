@@ -26,7 +26,7 @@ from kalmark.models.landmarks import Point2D, Point3D
 from kalmark.models.protocols import StartNoise, range_limit, world_of
 from kalmark.models.sensors import Wall
 from kalmark.models.tags import corners, tag_seen_from
-from kalmark.models.walls import facing
+from kalmark.models.walls import orient_segments
 from kalmark.simulate.layouts import Scenery
 
 Indices = Index
@@ -171,7 +171,7 @@ def halves(segments: Array) -> tuple[Array, Array]:
     return segments[:, :d], segments[:, d:]
 
 
-def in_frame(sort: str, T: Array, values: Array) -> Array:
+def things_in_frame(sort: str, T: Array, values: Array) -> Array:
     """Return things (K, n) as they are in the frame T: points, both ends of segments, poses of tags."""
     look: Any = _LOOK[len(T)]
     if sort == POINTS:
@@ -182,7 +182,7 @@ def in_frame(sort: str, T: Array, values: Array) -> Array:
     return tag_seen_from(T, np.ascontiguousarray(values))[0]
 
 
-def exact(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
+def exact_measurements(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
     """Return which v (K, n) in the sensor's frame are observable, and their measurements (K, m) without noise."""
     sort = looks_for(sensor)
     if sort == SEGMENTS:
@@ -197,7 +197,7 @@ def exact(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
     return inside, e
 
 
-def noisy(sensor: Any, e: Array, rng: Generator, cov: Array | None = None) -> Array:
+def noisy_measurements(sensor: Any, e: Array, rng: Generator, cov: Array | None = None) -> Array:
     """Return noisy measurements of the exact ones e (K, m), angles wrapped, poses turned.
 
     A covariance `cov` (K, m, m) overrides the sensor's own noise.
@@ -212,10 +212,10 @@ def noisy(sensor: Any, e: Array, rng: Generator, cov: Array | None = None) -> Ar
     y = e.copy()
     y[:, : n.shape[1]] += n  # a tag's size is known, not measured
     y = np.where(sensor.angular, wrap(y), y) if len(sensor.angular) == y.shape[1] else y
-    return facing(y) if isinstance(sensor, Wall) else y  # noise may take a line to the other side
+    return orient_segments(y) if isinstance(sensor, Wall) else y  # noise may take a line to the other side
 
 
-def possible(sensor: Any, y: Array) -> Indices:
+def is_reportable(sensor: Any, y: Array) -> Indices:
     """Return which noisy measurements y (K, m) a sensor can report: noise may take a range below zero."""
     return np.flatnonzero((y[:, 0] >= 0) | (sensor.columns[0] != "range_m"))
 
@@ -230,7 +230,7 @@ def gaussian(cov: Array, rng: Generator) -> Array:
     return np.einsum("...ij,...j->...i", axes, draw)
 
 
-def chosen(
+def select_reported(
     things: Things, near: Indices, distance: Array, new_per_step: int | None, max_per_scan: int | None, rng: Generator
 ) -> Indices:
     """Return which (R,) of the visible things, rows of `near` (K,), are reported, in order, and note them as seen."""
@@ -244,7 +244,7 @@ def chosen(
     return rows
 
 
-def faulty(
+def report_with_faults(
     sensor: Any, sighted: Sighted, sensing: SimulatedSensing, k: int, things: Things, rng: Generator
 ) -> tuple[Sighted, list[Id | None]]:
     """Return what is reported at step k of what is seen, before noise, and what each observation is really of."""
@@ -254,7 +254,7 @@ def faulty(
     v, e, sizes, ids = sighted
     if sensing.outliers:
         wrong = np.flatnonzero(rng.random(len(ids)) < sensing.outliers)
-        found, y = elsewhere(sensor, v[wrong], sizes[wrong], min(range_limit(sensor), things.extent()), rng)
+        found, y = false_measurements(sensor, v[wrong], sizes[wrong], min(range_limit(sensor), things.extent()), rng)
         e[wrong[found]] = y[found]
         real = [None if i in wrong[found] else name for i, name in enumerate(real)]
     kept = rng.random(len(ids)) >= (sensing.dropouts or 0.0)
@@ -264,7 +264,7 @@ def faulty(
     return Sighted(v[rows], e[rows], sizes[rows], reported), [real[i] for i in rows]
 
 
-def elsewhere(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generator) -> tuple[Flags, Array]:
+def false_measurements(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generator) -> tuple[Flags, Array]:
     """Return false measurements (K, m): of the same things at places drawn from the field of view, and which succeeded.
 
     Places are uniform in the field of view within reach: in an image, uniform over its pixels.
@@ -282,7 +282,7 @@ def elsewhere(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generato
             moved += np.column_stack([shift, shift])
         else:
             moved[:, : places.shape[1]] = places
-        inside, y = exact(sensor, moved, sizes[missing])
+        inside, y = exact_measurements(sensor, moved, sizes[missing])
         found[missing], e[missing[inside]] = inside, y[inside]
     return found, e
 

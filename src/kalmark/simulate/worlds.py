@@ -25,12 +25,12 @@ from kalmark.config.schema import (
     StartConfig,
     robot_world,
 )  # fmt: skip
-from kalmark.config.sections import Positive, Section, expected, model_of
-from kalmark.config.tree import Tree, merged, read_tree
+from kalmark.config.sections import Positive, Section, model_of, unexpected_value
+from kalmark.config.tree import Tree, merge_trees, read_tree
 from kalmark.simulate.layouts import Layout, TexturedPlanes, TexturedRoom
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import SimulatedSensing
-from kalmark.slam.description import plain
+from kalmark.slam.description import plain_value
 
 Count = Annotated[int, Field(ge=1)]
 IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types of sensors whose images can be rendered
@@ -48,16 +48,18 @@ class _Underway(Section):
         robot: Any = self
         size, route = len(model_of(robot.motion).columns), self.route
         if isinstance(route, Constant) and len(route.u) != size:
-            raise expected(f"a route whose u has the {size} numbers of {robot.motion.type}, not {len(route.u)}")
+            raise unexpected_value(f"a route whose u has the {size} numbers of {robot.motion.type}, not {len(route.u)}")
         if isinstance(route, Waypoints) and isinstance(self, SimulatedRobot) and len(route.points_m[0]) != 2:
-            raise expected("a route whose points_m are [x, y]: the robot moves in the plane")
+            raise unexpected_value("a route whose points_m are [x, y]: the robot moves in the plane")
         for name in self.sensing:
             if name not in robot.sensors:
-                raise expected(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
+                raise unexpected_value(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
             if self.sensing[name].images and robot.sensors[name].type not in IMAGING:
-                raise expected(f"images of {' or '.join(IMAGING)}, not of {name!r}, a {robot.sensors[name].type}")
+                raise unexpected_value(
+                    f"images of {' or '.join(IMAGING)}, not of {name!r}, a {robot.sensors[name].type}"
+                )
             if self.sensing[name].loop_reach_m is not None and getattr(robot.sensors[name], "keep", 1) == 1:
-                raise expected(f"loop_reach_m of an odometer whose keep is 0, or 2 or more, not of {name!r}")
+                raise unexpected_value(f"loop_reach_m of an odometer whose keep is 0, or 2 or more, not of {name!r}")
         return self
 
 
@@ -116,14 +118,14 @@ class World(OfFile):
     @model_validator(mode="after")
     def _is_one_world(self) -> World:
         if self.sight_robots and self.has_signatures:
-            raise expected("sight_robots false where a sensor measures signatures: robots have none")
+            raise unexpected_value("sight_robots false where a sensor measures signatures: robots have none")
         if len({type(robot) for robot in self.robots.values()}) > 1:
-            raise expected("robots that all move in the plane, or all in space")
+            raise unexpected_value("robots that all move in the plane, or all in space")
         pictures = any(sensing.images for robot in self.robots.values() for sensing in robot.sensing.values())
         if pictures and not isinstance(self.world, TexturedPlanes | TexturedRoom):
-            raise expected("images in a world of textures, textured_room or textured_planes")
+            raise unexpected_value("images in a world of textures, textured_room or textured_planes")
         if self.dimensions == 2 and self.world.scenery(np.random.default_rng(0)).of_space:
-            raise expected("robots of space, or a world of the plane: its landmarks are in space")
+            raise unexpected_value("robots of space, or a world of the plane: its landmarks are in space")
         return self
 
     @property
@@ -166,12 +168,12 @@ class World(OfFile):
         """Return the text of a file that describes this world, every default written out; `load_world` reads it."""
         yaml, out = YAML(), io.StringIO()
         yaml.default_flow_style = False
-        yaml.dump(plain(self.model_dump(exclude_none=True)), out)
+        yaml.dump(plain_value(self.model_dump(exclude_none=True)), out)
         return out.getvalue()
 
     def _laid_over(self, values: dict[str, Any]) -> Tree:
         """Return `values` with `filter` laid over, its keys remembering where they were written."""
-        tree = Tree(values=merged(values, deepcopy(self.filter)))
+        tree = Tree(values=merge_trees(values, deepcopy(self.filter)))
         known = tree.values.get("map", {}).get("known")
         if isinstance(known, str) and known != TRUTH and self._file is not None:  # beside the world, if it is there
             beside = self._file.resolve().parent / known

@@ -49,7 +49,7 @@ class Alternative:
             own.add(space, map_.mean(slot))
         rows = np.concatenate([own.index(slot) for slot in slots])
         own.predict(rows, np.eye(len(rows)), map_.covariance(slots))
-        return cls(own, alone(moving), since_ns)
+        return cls(own, motion_of_alternative(moving), since_ns)
 
     def widen(self, z: Array, Z: Array, R: Array) -> None:
         """Make the robot more uncertain, in the proportions it has, than it takes for a position of it to fit.
@@ -87,12 +87,12 @@ class Alternative:
         return self.misses >= NEEDED
 
 
-def alone(moving: Moving) -> Moving:
+def motion_of_alternative(moving: Moving) -> Moving:
     """Return how a robot moves in the map of an alternative."""
     return replace(moving, error=None, left_out=[])
 
 
-def put(map_: Map, slot: int, mean: Array, cov: Array) -> None:
+def write_robot(map_: Map, slot: int, mean: Array, cov: Array) -> None:
     """Write the first numbers of a robot's block, and the covariance (d, d) of these, independent of all else."""
     map_.predict(map_.index(slot)[: len(cov)], np.zeros_like(cov), cov)
     map_.set_predicted(slot, np.concatenate([mean, map_.mean(slot)[len(mean) :]]))

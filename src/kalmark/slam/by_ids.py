@@ -15,7 +15,7 @@ from kalmark.filter.estimators import Update
 from kalmark.report import JudgedScan, Report
 from kalmark.slam import moves, tentative
 from kalmark.slam.checks import measurements
-from kalmark.slam.held_readings import again
+from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.slam.surveyed_corrections import is_tried
@@ -23,7 +23,7 @@ from kalmark.tracks.channel import Channel
 from kalmark.tracks.scan import ScanContext
 
 
-def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Report | None:
+def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) -> Report | None:
     """Correct the map by a scan whose policy is `by_ids`; None of a scan of which something is to be decided."""
     tracks, name, ids = state.tracks, event.robot, cast("tuple[Id, ...]", event.ids)
     moving = state.moving[name]
@@ -39,7 +39,7 @@ def corrected(state: State, event: Scan, channel: Channel, policy: Policy) -> Re
     state.t_ns = event.t_ns
     report.gaps, slots = moves.advance(state, name), tracks.slots_of(ids)
     if state.repeats((name, event.sensor), event.t_ns, event.y, event.ids):
-        return again(report, ids, channel.dof)
+        return record_repeated_reading(report, ids, channel.dof)
     parallax = not channel.finds_depth
     done = state.corrected(
         Update(model.model, moving.slot, channel.mount, slots, model.d, event.y, R, channel.gate, parallax), event

@@ -9,7 +9,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError, ModelError
-from kalmark.events import MOST, Control, Fix, Scan, finite, is_number, refuse_huge, shown, when
+from kalmark.events import MOST, Control, Fix, Scan, finite, is_number, label_of_event, refuse_huge, short_text
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, Motion, OwnNoise, Sensor, coasts, innovation_size
 
@@ -19,7 +19,9 @@ ROUNDING = 1e-3  # of a correlation
 SEMIDEFINITE = 1e-9  # in units of its own sigmas, by which rounding may take an eigenvalue below zero
 
 
-def covariance(value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError) -> Array:
+def check_covariance(
+    value: Any, size: int, what: str, *, definite: bool, error: type[KalmarkError] = EventError
+) -> Array:
     """Return a copy of a (size, size) covariance; raise `error` if it is asymmetric or not positive (semi)definite."""
     cov = finite(value, what, MOST["m"] ** 2, error)
     if cov.shape != (size, size):
@@ -33,20 +35,20 @@ def instance(value: Any, protocol: type, what: str, expected: str) -> None:
     if isinstance(value, type):
         raise ModelError(f"{what} is the class {value.__name__}, expected an instance: {value.__name__}(...)")
     if not isinstance(value, protocol):
-        raise ModelError(f"{what} is {shown(value)}, expected {expected}")
+        raise ModelError(f"{what} is {short_text(value)}, expected {expected}")
 
 
-def able(value: Any, methods: tuple[str, ...], what: str, expected: str) -> None:
+def require_methods(value: Any, methods: tuple[str, ...], what: str, expected: str) -> None:
     """Raise ModelError if `value` lacks one of these methods, or is a class itself instead of one of its kind."""
     instance(value, object, what, expected)
     if not all(callable(getattr(value, method, None)) for method in methods):
-        raise ModelError(f"{what} is {shown(value)}, expected {expected}")
+        raise ModelError(f"{what} is {short_text(value)}, expected {expected}")
 
 
 def refuse_odd_association(value: Any, what: str) -> None:
     """Refuse what does not decide which landmark was seen."""
     expected = "an object like km.association.Automatic(), with threshold and associate"
-    able(value, ("threshold", "associate"), what, expected)
+    require_methods(value, ("threshold", "associate"), what, expected)
 
 
 def refuse_odd_parts(
@@ -55,14 +57,16 @@ def refuse_odd_parts(
     """Refuse what a Slam cannot be made of."""
     refuse_odd_association(association, "association")
     like = "an object like km.estimators.Ekf(), with predict, correct, for_fixes and pose_jacobian"
-    able(estimator, ("predict", "correct", "for_fixes", "pose_jacobian"), "estimator", like)
+    require_methods(estimator, ("predict", "correct", "for_fixes", "pose_jacobian"), "estimator", like)
     if landmarks is not None:
         instance(landmarks, Landmark, "landmarks", "a landmark model")
     instance(upkeep, Upkeep, "upkeep", "an Upkeep")
     if reparametrize is not None and not (isinstance(reparametrize, int | float) and reparametrize >= 0):
-        raise ModelError(f"reparametrize is {shown(reparametrize)}, expected a number of at least 0, or None: never")
+        raise ModelError(
+            f"reparametrize is {short_text(reparametrize)}, expected a number of at least 0, or None: never"
+        )
     if not is_number(longest_pause_s) or not longest_pause_s > 0:
-        raise ModelError(f"longest_pause_s is {shown(longest_pause_s)}, expected a number of seconds above 0")
+        raise ModelError(f"longest_pause_s is {short_text(longest_pause_s)}, expected a number of seconds above 0")
 
 
 def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[KalmarkError] = EventError) -> None:
@@ -71,7 +75,7 @@ def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[Kalma
     with np.errstate(over="ignore"):
         skewed = np.abs(covs - covs.swapaxes(1, 2)).max(axis=(1, 2), initial=0.0) > 1e-9 * scale
     if skewed.any():
-        raise error(f"{what} is {shown(covs[np.argmax(skewed)].tolist())}, expected a symmetric matrix")
+        raise error(f"{what} is {short_text(covs[np.argmax(skewed)].tolist())}, expected a symmetric matrix")
     variances = np.diagonal(covs, axis1=1, axis2=2)
     sigma = np.sqrt(np.maximum(variances, LEAST_VARIANCE))  # in units of these: no large variance hides another
     lowest = np.linalg.eigvalsh(covs / sigma[:, :, None] / sigma[:, None, :]).min(axis=1)
@@ -96,14 +100,14 @@ def fault_of(P: Array) -> str:
     )
 
 
-def numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -> Array:
+def check_numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -> Array:
     """Return a copy of (size,) finite numbers; raise `error` if it is anything else."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{what} is {shown(value)}, expected {size} finite numbers") from None
+        raise error(f"{what} is {short_text(value)}, expected {size} finite numbers") from None
     if array.shape != (size,) or not np.isfinite(array).all():
-        raise error(f"{what} is {shown(array.tolist())}, expected {size} finite numbers")
+        raise error(f"{what} is {short_text(array.tolist())}, expected {size} finite numbers")
     return finite(array, what, error=error)
 
 
@@ -122,26 +126,26 @@ def refuse_bad_control(event: Control, motion: Motion) -> None:
     columns = motion.columns
     if event.share != 1.0 and (motion.held or coasts(motion)):
         rates = f"expected 1: the controls {', '.join(columns)} are no increments of a pose, and only these have parts"
-        raise EventError(f"{when(event)}: share is {event.share:g}, {rates}")
+        raise EventError(f"{label_of_event(event)}: share is {event.share:g}, {rates}")
     if event.u.shape != (len(columns),):
-        raise EventError(f"{when(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
+        raise EventError(f"{label_of_event(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
     if event.largest > SMALLEST_BOUND:
-        refuse_huge(event.u, columns, when(event))
+        refuse_huge(event.u, columns, label_of_event(event))
     if event.cov is not None:
-        covariance(event.cov, len(columns), f"{when(event)}: cov", definite=False)
-        refuse_vague(event.cov, columns, when(event))
+        check_covariance(event.cov, len(columns), f"{label_of_event(event)}: cov", definite=False)
+        refuse_vague(event.cov, columns, label_of_event(event))
     more = event.uneven
     if more is not None and (event.share == 1.0 or more.shape != (len(columns),) or (more < 0.0).any()):
         wanted = f"{len(columns)} variances, of a part of an increment: share below 1"
-        raise EventError(f"{when(event)}: uneven is {shown(more.tolist())}, expected {wanted}")
+        raise EventError(f"{label_of_event(event)}: uneven is {short_text(more.tolist())}, expected {wanted}")
 
 
 def refuse_bad_fix(event: Fix, size: int) -> None:
     """Refuse a fix that is not a position (size,) with its covariance."""
     if event.y.shape != (size,):
         expected = "x and y in m" if size == 2 else "x, y and z in m"
-        raise EventError(f"{when(event)}: y has shape {event.y.shape}, expected ({size},): {expected}")
-    covariance(event.cov, size, f"{when(event)}: cov", definite=True)
+        raise EventError(f"{label_of_event(event)}: y has shape {event.y.shape}, expected ({size},): {expected}")
+    check_covariance(event.cov, size, f"{label_of_event(event)}: cov", definite=True)
 
 
 def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | None = None) -> Array:
@@ -152,29 +156,31 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
     m, count = len(sensor.columns), len(event.y)
     if event.width != m and (count or event.width):
         expected = f"expected {m}: {', '.join(sensor.columns)}"
-        raise EventError(f"{when(event)}: y has {event.width} columns, {expected}")
+        raise EventError(f"{label_of_event(event)}: y has {event.width} columns, {expected}")
     if count > MOST_OBSERVATIONS:
-        raise EventError(f"{when(event)}: {count} observations, expected at most {MOST_OBSERVATIONS} in one scan")
+        raise EventError(
+            f"{label_of_event(event)}: {count} observations, expected at most {MOST_OBSERVATIONS} in one scan"
+        )
     if count and event.largest > SMALLEST_BOUND:
-        refuse_huge(event.y, sensor.columns, when(event))
+        refuse_huge(event.y, sensor.columns, label_of_event(event))
     if check is not None and count:
         try:
             check(event.y)
         except EventError as error:
-            raise EventError(f"{when(event)}: {event.robot}.{event.sensor}, {error}") from None
+            raise EventError(f"{label_of_event(event)}: {event.robot}.{event.sensor}, {error}") from None
     if event.cov is None and not count:
         return np.zeros((0, m, m))
-    what, p = f"{when(event)}: cov", innovation_size(sensor)
+    what, p = f"{label_of_event(event)}: cov", innovation_size(sensor)
     if event.cov is None:
         R = sensor.noise(event.y)
         if np.shape(R) != (count, p, p) and not isinstance(sensor, OwnNoise):
             wrong = f"noise of {count} measurements has shape {np.shape(R)}, expected ({count}, {p}, {p})"
-            raise EventError(f"{when(event)}: {event.robot}.{event.sensor}, {type(sensor).__name__}: {wrong}")
+            raise EventError(f"{label_of_event(event)}: {event.robot}.{event.sensor}, {type(sensor).__name__}: {wrong}")
         return R
     if event.cov.shape not in ((p, p), (count, p, p)):
         raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
     _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)
-    refuse_vague(event.cov, sensor.columns, when(event))
+    refuse_vague(event.cov, sensor.columns, label_of_event(event))
     # a copy in order: one that cannot be written, or has another order, would be compiled for, too
     covs = np.array(np.broadcast_to(event.cov, (count, p, p)), order="C")
     return sensor.noise_from(event.y, covs) if isinstance(sensor, OwnNoise) else covs

@@ -15,7 +15,7 @@ from kalmark.association.protocol import Decision, Mixture
 from kalmark.filter.estimators import Averaging, Correction, Update
 from kalmark.geometry.gaussian import gate
 from kalmark.management import ambiguous_tags, measured_depths
-from kalmark.management.attention import chosen
+from kalmark.management.attention import select_observations
 from kalmark.report import INDEFINITE, JudgedScan, Observation
 from kalmark.slam import surveyed_corrections, tentative
 from kalmark.slam.policy import Policy
@@ -33,7 +33,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
     found: list[Observation] = []
     judged: list[JudgedScan] = []
     if most is not None and sum(len(rows) for _, rows in groups) > most:
-        groups, out = chosen(scan, policy.attention, groups, decisions)
+        groups, out = select_observations(scan, policy.attention, groups, decisions)
         why = f"not among the {most} of most information"
         found += [Observation(k, scan.ids[k], "ignored", decisions[k][0], None, why) for k in out]  # type: ignore[arg-type]
     if policy.attention.sequential:
@@ -51,7 +51,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         approach(range(len(rows)), least)
         update = scan.update(model, slots, rows)
         done = (
-            surveyed_corrections.corrected(state, scan, names, update, least, state.estimator, approach)
+            surveyed_corrections.correct_by_surveys(state, scan, names, update, least, state.estimator, approach)
             if on_trial
             else state.corrected(update, scan.event)
         )
@@ -80,7 +80,7 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
         l, estimator = known.means(names), state.estimator.for_fixes()
         approach = partial(_approach, state, scan, model.exactly, np.full(len(rows), scan.robot), rows, l)
         approach(range(len(rows)), least)
-        done = surveyed_corrections.corrected(
+        done = surveyed_corrections.correct_by_surveys(
             state, scan, names, scan.known_update(model, l, rows), least, estimator, approach
         )
         done = done._replace(e=done.e[:, :m])
@@ -114,8 +114,14 @@ def _approach(
     """
     at = list(some)
     mine, of, exactly = [rows[i] for i in at], slots[at], None if known is None else known[at]
-    found = [ambiguous_tags.approach(scan, model, of, mine, exactly)] if scan.channel.far is not None else []
-    found += [measured_depths.approach(scan, model, of, mine)] if scan.channel.depths and known is None else []
+    found = (
+        [ambiguous_tags.correct_by_tag_poses(scan, model, of, mine, exactly)] if scan.channel.far is not None else []
+    )
+    found += (
+        [measured_depths.correct_by_inverse_ranges(scan, model, of, mine)]
+        if scan.channel.depths and known is None
+        else []
+    )
     estimator, used = state.estimator if known is None else state.estimator.for_fixes(), False
     for near in found:
         used |= near is not None and bool(

@@ -52,26 +52,28 @@ def describe(slam: Estimate) -> Description:
     return {"robots": {name: _robot(robot) for name, robot in slam.robots.items()}, **out, "map": kept}
 
 
-def plain(value: Any) -> Any:
+def plain_value(value: Any) -> Any:
     """Return a value made of dicts, lists, texts, numbers and None only, ready for YAML or JSON."""
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(item) for item in value]
+        return [plain_value(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return plain_value(value.tolist())
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
-def model(value: Any) -> Description:
+def describe_model(value: Any) -> Description:
     """Return the type and the parameters of a model; a class without a name in configurations is file.py:Class."""
     name = registered_name(type(value)) or own_name(type(value))
-    given = {own.name: plain(vars(value)[own.name]) for own in parameters(type(value))}
+    given = {own.name: plain_value(vars(value)[own.name]) for own in parameters(type(value))}
     return given if name in UNTYPED else {"type": name} | given
 
 
 def _described(value: Any) -> Any:
-    return plain(value) if isinstance(value, bool | int | float | str | np.generic | None) else model(value)
+    return (
+        plain_value(value) if isinstance(value, bool | int | float | str | np.generic | None) else describe_model(value)
+    )
 
 
 def _robot(robot: Robot) -> Description:
@@ -79,11 +81,11 @@ def _robot(robot: Robot) -> Description:
     start = describe_place(robot.start, world, robot.cov, state_columns(robot.motion))
     own = {name: _described(value) for name, value in vars(robot).items() if name not in OF_PLACE}
     sensors = {name: _mount(mount, world) for name, mount in robot.sensors.items()}
-    return {"motion": model(robot.motion), "start": start, **own, "sensors": sensors}
+    return {"motion": describe_model(robot.motion), "start": start, **own, "sensors": sensors}
 
 
 def _mount(mount: Mount, world: str) -> Description:
-    out, place = model(mount.sensor), describe_place(mount.at, world, mount.cov)
+    out, place = describe_model(mount.sensor), describe_place(mount.at, world, mount.cov)
     if isinstance(mount.sensor, Raised):
         place["z_m"] = out.pop("height_m")
     own = {name: _described(value) for name, value in vars(mount).items() if name not in OF_PLACE}
@@ -97,7 +99,7 @@ def describe_place(at: Any, world: str, cov: Any = None, behind: tuple[str, ...]
 
     `behind` are the names of what the state has behind its pose.
     """
-    at, pose, names = np.asarray(at, dtype=np.float64), 3 if world == "plane" else 7, known(behind, world)
+    at, pose, names = np.asarray(at, dtype=np.float64), 3 if world == "plane" else 7, state_names(behind, world)
     said: Description = describe_pose(at[:pose]) | dict(zip(names, at[pose:].tolist(), strict=False))
     P = np.zeros((0, 0)) if cov is None else np.asarray(cov, dtype=np.float64)
     keys, sigmas = [*SIGMAS[world], *map(sigma_of, names)], np.zeros(len(at))
@@ -117,7 +119,7 @@ def describe_place(at: Any, world: str, cov: Any = None, behind: tuple[str, ...]
 
 def state_of(said: Mapping[str, Any], behind: tuple[str, ...]) -> list[float]:
     """Return the components of a start's state after its pose; empty if it has none."""
-    names = known(behind, world_of(said))
+    names = state_names(behind, world_of(said))
     return [said[name] for name in names] if said.get("state") is None else [*said["state"]]
 
 
@@ -129,7 +131,7 @@ def covariance_of(said: Mapping[str, Any], dof: int, behind: tuple[str, ...] = (
     if said.get("cov") is not None:
         return np.array(said["cov"], dtype=np.float64)
     world, sigmas = world_of(said), np.zeros(dof)
-    for k, (key, axis) in enumerate([*SIGMAS[world], *map(sigma_of, known(behind, world))][:dof]):
+    for k, (key, axis) in enumerate([*SIGMAS[world], *map(sigma_of, state_names(behind, world))][:dof]):
         sigma = np.broadcast_to(np.asarray(said[key], dtype=np.float64), 3)[axis]
         sigmas[k] = np.radians(sigma) if key.endswith("_deg") else sigma
     return np.diag(np.square(sigmas)) if sigmas.any() else None
@@ -141,6 +143,6 @@ def sigma_of(name: str) -> tuple[str, int]:
     return f"sigma_{_AXIS.sub('', name, count=1)}", "xyz".index(found[0][-1]) if found else 0
 
 
-def known(behind: tuple[str, ...], world: str) -> tuple[str, ...]:
+def state_names(behind: tuple[str, ...], world: str) -> tuple[str, ...]:
     """Return the names of a state behind its pose, if a start has keys for all of them."""
     return behind if {*behind} <= {*STATES[world]} else ()

@@ -105,8 +105,8 @@ class Estimate:
             covs.append(np.zeros((space.dof, space.dof)))
             counts.append(known.observations(name))
         upkeep = next((state.policies[key].upkeep for key in self.tracks.looks), state.settings.upkeep)
-        odds = existence.of_map(self.tracks, upkeep)
-        return LandmarkTable(names, kinds, means, covs, counts, odds, existence.unseen(odds, upkeep))
+        odds = existence.log_odds_of_map(self.tracks, upkeep)
+        return LandmarkTable(names, kinds, means, covs, counts, odds, existence.unseen_landmarks(odds, upkeep))
 
     def _each(self, slots: list[int]) -> tuple[list[Array], list[Array]]:
         """Return the mean and the covariance of each of some blocks."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, MapError
-from kalmark.events import Control, seconds
+from kalmark.events import Control, seconds_text
 from kalmark.models.protocols import Motion
 from kalmark.report import Gap
 
@@ -99,7 +99,7 @@ class Gaps:
         A held control stays held, and the motion is unknown from then on.  Raises EventError where that is refused.
         """
         if self.action == "refuse":
-            what = f"{self.robot!r}: u is {control.u.tolist()} at t={seconds(control.t_ns)} s"
+            what = f"{self.robot!r}: u is {control.u.tolist()} at t={seconds_text(control.t_ns)} s"
             raise EventError(f"{what}, expected at most {self.max_speed_mps} m/s and {self.max_turn_radps} rad/s")
         begin = control.t_ns if self.motion.held or self.last_ns is None else self.last_ns
         if self.since_ns is None:
@@ -142,7 +142,7 @@ class Gaps:
             return None
         if self.action == "refuse" and self.left_out_ns is None:
             gap_s, usual_s = (t_ns - self.last_ns) * 1e-9, self.usual_ns * 1e-9
-            what = f"{self.robot!r} had no control for {gap_s:.3g} s from t={seconds(self.last_ns)} s on"
+            what = f"{self.robot!r} had no control for {gap_s:.3g} s from t={seconds_text(self.last_ns)} s on"
             raise EventError(f"{what}, expected one every {usual_s:.3g} s; gaps: widen bridges that")
         if self.since_ns is None:
             self.since_ns = self.until_ns = self.last_ns + (self.usual_ns if self.motion.held else 0)

@@ -30,7 +30,7 @@ from kalmark.geometry.spaces import Space
 from kalmark.models.observe import linearize
 from kalmark.slam.alternative import Alternative
 from kalmark.slam.held_control import MotionPart, Moving
-from kalmark.tracks.linearity import SIGMAS, bends, turn_holds, turned
+from kalmark.tracks.linearity import SIGMAS, bends, turn_holds, turn_pose
 from kalmark.tracks.surveys import SURVEYED
 
 PIECES, PIECE_RAD = 12, 0.3  # of a circle of headings, and the sigma of each: they overlap to a sum that is even
@@ -141,7 +141,7 @@ class GaussianSum:
         parts, log_weights, expected = list[Alternative](), list[float](), None
         likeliest = -math.inf
         for each, w in zip(self.parts, self.log_weights.tolist(), strict=True):
-            for piece, w_piece, is_done in refined(each, w, seen):
+            for piece, w_piece, is_done in split_part(each, w, seen):
                 if is_done:
                     gain = seen.anywhere
                 else:
@@ -160,8 +160,8 @@ class GaussianSum:
 
     def _begin(self, estimator: Estimator, seen: KnownObservation) -> None:
         """Begin parts from the prior, by an observation."""
-        first = copied(self.prior)
-        pieces = refined(first, self.prior_log, seen)
+        first = copy_alternative(self.prior)
+        pieces = split_part(first, self.prior_log, seen)
         for piece, _, is_done in pieces:
             if not is_done:
                 estimator.correct(piece.map, seen.update._replace(gate=seen.gate))
@@ -198,7 +198,7 @@ class GaussianSum:
             if len(group) > 1:
                 slots = range(len(one.map.spaces))
                 means, cov = moments([self.parts[i] for i in group.tolist()], w, slots, slot)
-                written(one.map, slots, means, cov)
+                write_blocks(one.map, slots, means, cov)
             parts.append(one)
             log_weights.append(_log_sum(w))
         self.parts, self.log_weights = parts, np.array(log_weights)
@@ -212,12 +212,12 @@ def _log_sum(logs: Array) -> float:
     return float(np.logaddexp.reduce(logs)) if len(logs) else -math.inf
 
 
-def copied(other: Alternative) -> Alternative:
+def copy_alternative(other: Alternative) -> Alternative:
     """Return the same robot once more."""
     return Alternative.of(other.map, other.moving, len(other.map.spaces), other.since_ns)
 
 
-def written(map_: Map, slots: Sequence[int], means: Sequence[Array], cov: Array) -> None:
+def write_blocks(map_: Map, slots: Sequence[int], means: Sequence[Array], cov: Array) -> None:
     """Write blocks of a map and their joint covariance, independent of all else."""
     for slot in slots:
         map_.index(slot)  # to activate a block may move those that are active
@@ -259,11 +259,11 @@ def moments(
     cov = np.einsum("k,kij->ij", w, P + off[:, :, None] * off[:, None, :])
     spread = min(-2.0 * math.log(max(float(abs(mean_turn)), 1e-300)), VAGUE_RAD**2)
     cov[t, t] += max(0.0, spread - cov[t, t])
-    return stepped(parts[0].map, slots, d), 0.5 * (cov + cov.T)
+    return retract_blocks(parts[0].map, slots, d), 0.5 * (cov + cov.T)
 
 
 # ---------------------------------------------------------------------- splitting
-def refined(each: Alternative, w: float, seen: KnownObservation) -> list[tuple[Alternative, float, bool]]:
+def split_part(each: Alternative, w: float, seen: KnownObservation) -> list[tuple[Alternative, float, bool]]:
     """Return a part with its log weight split until an observation is as good as linear over each piece.
 
     Pieces of a ring have taken the observation: the third of each is then true.
@@ -273,7 +273,7 @@ def refined(each: Alternative, w: float, seen: KnownObservation) -> list[tuple[A
         pieces = headings(each, w)
     out: list[tuple[Alternative, float, bool]] = []
     for piece, w_piece in pieces:
-        is_bent = seen.is_distance and bent_axes(piece.map, piece.moving.slot, seen)[1:].any()
+        is_bent = seen.is_distance and nonlinear_axes(piece.map, piece.moving.slot, seen)[1:].any()
         around = ring(piece, seen) if is_bent else []
         out += [(one, w_piece + more, True) for one, more in around]
         if not around:
@@ -285,7 +285,7 @@ def refined(each: Alternative, w: float, seen: KnownObservation) -> list[tuple[A
     return out
 
 
-def bent_axes(map_: Map, robot: int, seen: KnownObservation) -> Flags:
+def nonlinear_axes(map_: Map, robot: int, seen: KnownObservation) -> Flags:
     """Return along which axes (3,) of a robot's pose no linearisation describes an observation."""
     update = seen.update
     pose = map_.mean(robot)[:3]
@@ -304,11 +304,11 @@ def headings(each: Alternative, w: float) -> list[tuple[Alternative, float]]:
     logs = np.logaddexp.reduce(-0.5 * wraps, axis=1)
     out = []
     for turn, more in zip(turns.tolist(), (logs - _log_sum(logs)).tolist(), strict=True):
-        means, own = stepped(each.map, slots, g * turn), g.copy()
-        means[robot][:3] = turned(each.map.mean(robot)[:3], g[t - 2 : t + 1] * turn)
+        means, own = retract_blocks(each.map, slots, g * turn), g.copy()
+        means[robot][:3] = turn_pose(each.map.mean(robot)[:3], g[t - 2 : t + 1] * turn)
         own[place] = rotation(turn) @ g[place]
-        piece = copied(each)
-        written(piece.map, slots, means, left + PIECE_RAD**2 * np.outer(own, own))
+        piece = copy_alternative(each)
+        write_blocks(piece.map, slots, means, left + PIECE_RAD**2 * np.outer(own, own))
         out.append((piece, w + more))
     return out
 
@@ -317,7 +317,7 @@ def ring(each: Alternative, seen: KnownObservation) -> list[tuple[Alternative, f
     """Return a part, corrected by a distance, as pieces of the ring about a landmark, with their log likelihoods."""
     slots, robot, mount = range(len(each.map.spaces)), each.moving.slot, seen.update.mount
     r, own = each.map.mean(robot), np.zeros(0) if mount < 0 else each.map.mean(mount)
-    found = distance(seen, own)
+    found = measured_distance(seen, own)
     if found is None:
         return []
     d, sigma = found
@@ -334,13 +334,13 @@ def ring(each: Alternative, seen: KnownObservation) -> list[tuple[Alternative, f
     toward, log_S = np.linalg.solve(S, z[:, :, None])[:, :, 0], np.linalg.slogdet(S)[1]
     logs, out = -0.5 * (np.einsum("ki,ki->k", z, toward) + log_S), []
     for k in np.flatnonzero(logs > logs.max() + math.log(LEAST)).tolist():
-        piece, cov = copied(each), P - to_all @ np.linalg.solve(S[k], to_all.T)
-        written(piece.map, slots, stepped(each.map, slots, to_all @ toward[k]), 0.5 * (cov + cov.T))
+        piece, cov = copy_alternative(each), P - to_all @ np.linalg.solve(S[k], to_all.T)
+        write_blocks(piece.map, slots, retract_blocks(each.map, slots, to_all @ toward[k]), 0.5 * (cov + cov.T))
         out.append((piece, float(logs[k])))
     return out
 
 
-def distance(seen: KnownObservation, own: Array) -> tuple[float, float] | None:
+def measured_distance(seen: KnownObservation, own: Array) -> tuple[float, float] | None:
     """Return the distance that a measurement stands for and its sigma, None where none does.
 
     `own` is the mount with the constants of the sensor, as they are in the map.
@@ -360,7 +360,7 @@ def distance(seen: KnownObservation, own: Array) -> tuple[float, float] | None:
     return None
 
 
-def stepped(map_: Map, slots: Sequence[int], step: Array) -> list[Array]:
+def retract_blocks(map_: Map, slots: Sequence[int], step: Array) -> list[Array]:
     """Return the means of blocks after an error of all of them, one after the other."""
     spaces = _spaces(map_, slots)
     parts = np.split(step, np.cumsum([space.dof for space in spaces])[:-1])

@@ -31,8 +31,8 @@ from kalmark.models.protocols import (
     Motion,
     SelfCalibrating,
     StateDiffusion,
-    calibrating,
     coasts,
+    self_calibrating,
     true_control,
 )
 from kalmark.report import Gap
@@ -80,7 +80,7 @@ class RateMean(NamedTuple):
         return RateMean(self.rate + (rate - self.rate) / number, number)
 
 
-def noise_of(motion: Motion, control: Control) -> Array:
+def control_covariance(motion: Motion, control: Control) -> Array:
     """Return the covariance N (k, k) of a control's error: its own or the model's, of a part its share of that."""
     if control.share == 1.0:
         return motion.control_noise(control.u) if control.cov is None else control.cov
@@ -104,7 +104,7 @@ class HeldInput:
     gaps: Gaps | None
 
     def __init__(self, motion: Motion, gaps: Gaps | None = None, rests_until_ns: int | None = None) -> None:
-        self.motion, self.coasts, self.calibrates = motion, coasts(motion), calibrating(motion) is not None
+        self.motion, self.coasts, self.calibrates = motion, coasts(motion), self_calibrating(motion) is not None
         self.t_ns = self.u = self.N = self.usual = self.mean = None
         self.fresh, self.gaps = True, None if self.coasts else gaps
         self.rests_until_ns = -math.inf if rests_until_ns is None else rests_until_ns
@@ -204,7 +204,7 @@ class HeldInput:
             return []
         if self.gaps is not None and self.gaps.limited and self.gaps.rules_out(control):
             return self._left_out(control, self.gaps)
-        N = noise_of(self.motion, control)
+        N = control_covariance(self.motion, control)
         if not self.motion.held:
             dt_s = 0.0 if self.t_ns is None else (control.t_ns - self.t_ns) * 1e-9
             part = self._lost(control.t_ns, control.u)
@@ -270,10 +270,10 @@ class Moving:
         That holds at the means of the constants, and B is that of the control as it usually is.
         """
         if self.error is None and self.bias is None:
-            return [], nothing(len(part.u)), part.u
+            return [], no_effect(len(part.u)), part.u
         slots, columns, u = [], [], part.u
         if self.error is not None:
-            slots, columns = [self.error], [identity(len(u))]
+            slots, columns = [self.error], [identity_effect(len(u))]
         if self.bias is not None and isinstance(self.motion, SelfCalibrating):
             a = map_.mean(self.bias)
             true, U_a = true_control(self.motion, u, a, part.dt_s)
@@ -316,19 +316,19 @@ def bias_name(robot: str) -> str:
 
 def bias_block(motion: Motion) -> tuple[Space, Array, Array] | None:
     """Return the space, the mean (c,) and the covariance (c, c) of the constants of a motion's controls, or None."""
-    model = calibrating(motion)
+    model = self_calibrating(motion)
     return (
         None if model is None else (Rn(len(model.calibration)), np.zeros(len(model.calibration)), model.calibration_cov)
     )
 
 
 @lru_cache
-def identity(size: int) -> Array:
+def identity_effect(size: int) -> Array:
     """Return the effect (size, size) of an error of the control itself."""
     return np.eye(size)
 
 
 @lru_cache
-def nothing(size: int) -> Array:
+def no_effect(size: int) -> Array:
     """Return the effect (size, 0) of no constants."""
     return np.zeros((size, 0))

@@ -28,7 +28,7 @@ CHANCE = math.exp(-0.5 * (np.euler_gamma + math.log(2.0))) / math.sqrt(2.0 * mat
 SAME = 1e-9  # differences are rounding below it, as a share of a number
 
 
-def again(report: Report, ids: Sequence[Id | None], p: int, of: Id | None = None) -> Report:
+def record_repeated_reading(report: Report, ids: Sequence[Id | None], p: int, of: Id | None = None) -> Report:
     """Enter into a report that all of a measurement, with innovations of p numbers, was given before."""
     report.blank(p)
     report.observations = [Observation(k, id_, "ignored", of, None, AGAIN) for k, id_ in enumerate(ids)]

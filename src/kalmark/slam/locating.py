@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.association.global_start import FEWEST, Located, located
+from kalmark.association.global_start import FEWEST, Located, locate_sensor
 from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
-from kalmark.association.relocalization import relocalized
+from kalmark.association.relocalization import relocalize
 from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.geometry import frames3d
@@ -28,7 +28,14 @@ from kalmark.geometry.gaussian import gate
 from kalmark.models.observe import linearize
 from kalmark.models.protocols import distances_alone, place_of
 from kalmark.report import JudgedScan, Observation
-from kalmark.slam.gaussian_sum import IN_A_ROW, GaussianSum, KnownObservation, bent_axes, log_likelihood, written
+from kalmark.slam.gaussian_sum import (
+    IN_A_ROW,
+    GaussianSum,
+    KnownObservation,
+    log_likelihood,
+    nonlinear_axes,
+    write_blocks,
+)
 from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.linearity import bends, turn_holds
@@ -40,7 +47,7 @@ ONE = "from an unknown place it takes two known landmarks, expected a second one
 DIRECTION = "it determines no distance from an unknown place, expected ranges too or a start with a smaller sigma_xy_m"
 
 
-def started(state: State, scan: ScanContext, query: Query) -> Located | None:
+def locate_in_known_map(state: State, scan: ScanContext, query: Query) -> Located | None:
     """Move a robot that may be anywhere in a known map to where its scan fits; None of a robot that may not.
 
     A scan that does not determine the pose corrects a Gaussian sum of poses, or waits with the reason.
@@ -53,7 +60,7 @@ def started(state: State, scan: ScanContext, query: Query) -> Located | None:
     if scan.channel.gives_places:
         if len(state.tracks.known) < FEWEST or (not shown and turn_holds(P)):
             return None
-        found = located(query)
+        found = locate_sensor(query)
         if found.T is not None:
             _put(state, scan, found.T)
             state.sums.pop(name, None)
@@ -61,7 +68,7 @@ def started(state: State, scan: ScanContext, query: Query) -> Located | None:
     if not can_be_summed(scan.channel):
         return None
     if sum_ is None or not shown:
-        is_turn, bent = turn_holds(P), _bent(state, scan)
+        is_turn, bent = turn_holds(P), _nonlinear_axes(state, scan)
         if bent is None:
             return None if is_turn or len(state.tracks.known) < FEWEST else Located(None, None, UNNAMED)
         is_distance = distances_alone(scan.channel.sensor)
@@ -76,7 +83,7 @@ def started(state: State, scan: ScanContext, query: Query) -> Located | None:
     return _summed(state, scan, sum_)
 
 
-def _bent(state: State, scan: ScanContext) -> Flags | None:
+def _nonlinear_axes(state: State, scan: ScanContext) -> Flags | None:
     """Return along which axes (3,) of the pose no linearisation describes what is seen of known landmarks.
 
     None where nothing is.
@@ -99,7 +106,7 @@ def _place(state: State, name: Any) -> Array:
     return known.mean(name) if name in known else state.map.mean(state.tracks.slot(name))
 
 
-def weighed(state: State, scan: ScanContext, judged: Sequence[JudgedScan]) -> None:
+def compare_alternatives(state: State, scan: ScanContext, judged: Sequence[JudgedScan]) -> None:
     """Compare the filter of a robot with the sum of where else it may be, by what both expected of a scan."""
     sum_ = state.sums.get(scan.event.robot)
     if sum_ is None or not can_be_summed(scan.channel) or not judged:
@@ -185,7 +192,7 @@ def _summed(state: State, scan: ScanContext, sum_: GaussianSum) -> Located:
             state.tracks.known.count([name], [True])
     _show(state, scan, sum_)
     for _, one in seen:
-        holds = turn_holds(_covariance(state, scan)) and not bent_axes(state.map, scan.robot, one).any()
+        holds = turn_holds(_covariance(state, scan)) and not nonlinear_axes(state.map, scan.robot, one).any()
         sum_.linear = sum_.linear + 1 if holds else 0
     if sum_.linear >= IN_A_ROW:
         del state.sums[robot]
@@ -199,11 +206,11 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     mounts = [channel.mount for (robot, _), channel in [*state.channels.items()] if robot == name]
     mounts += [reader.mount for (robot, _), reader in state.readers.items() if robot == name]
     slots = [moving.slot, *(slot for slot in (moving.bias, *mounts) if slot is not None and slot >= 0)]
-    written(state.map, slots, *sum_.moments(slots))
+    write_blocks(state.map, slots, *sum_.moments(slots))
     state.clones.moved(name)
 
 
-def decided(
+def decide(
     state: State, scan: ScanContext, query: Query, decide: Callable[[Query], Sequence[Decision]]
 ) -> tuple[Query, Sequence[Decision]]:
     """Return the query and the decisions on a scan; a robot adrift is moved first.
@@ -232,11 +239,11 @@ def _fitting(state: State, scan: ScanContext, query: Query) -> Array | None:
     scan.adrift = held.is_adrift
     if scan.adrift:
         with suppress(np.linalg.LinAlgError):
-            return relocalized(query)
+            return relocalize(query)
     return None
 
 
-def placed_again(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:
+def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:
     """Put a robot of space where its sensor is at T (7,), with the covariance (6, 6), wherever it was."""
     slot = state.moving[name].slot
     r = state.map.mean(slot)
@@ -246,7 +253,7 @@ def placed_again(state: State, channel: Channel, name: str, T: Array, cov: Array
     state.clones.moved(name)
 
 
-def widened(state: State, name: str, landmarks: Sequence[Id], factor: float) -> None:
+def inflate_covariance(state: State, name: str, landmarks: Sequence[Id], factor: float) -> None:
     """Multiply the joint covariance of a robot and of landmarks by a factor: their drift is larger than that."""
     slots = [state.moving[name].slot, *state.tracks.slots_of(landmarks).tolist()]
     rows = np.concatenate([state.map.index(slot) for slot in slots])

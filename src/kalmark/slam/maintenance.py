@@ -30,7 +30,7 @@ def review(state: State, scan: ScanContext, policy: Policy, seen: Sequence[Obser
             continue
         point = None
         with suppress(np.linalg.LinAlgError):
-            point = reparametrize.simplified(scan, track, policy.linear)
+            point = reparametrize.point_if_linear(scan, track, policy.linear)
         if point is not None:
             try:
                 slot = state.add(point.start)
@@ -41,7 +41,9 @@ def review(state: State, scan: ScanContext, policy: Policy, seen: Sequence[Obser
             state.map.remove(old)
     if scan.channel.joins:
         mine = [track for _, track in fused]
-        for track, extent in zip(mine, wall_growth.grown(scan, mine, [o.index for o, _ in fused]), strict=True):
+        for track, extent in zip(
+            mine, wall_growth.extend_extents(scan, mine, [o.index for o, _ in fused]), strict=True
+        ):
             track.extent = extent
     for o, track in fused if not scan.channel.joins else ():
         if track.extent is not None and isinstance(track.model, Segmented) and track.model.extend:
@@ -75,7 +77,9 @@ def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
         state.remove(name)
         report.removed += ((name, surveyed_corrections.ELSEWHERE),)
     if existence.concerns(scan, policy.upkeep):
-        for track in existence.gone(state.tracks, policy.upkeep, existence.look(scan, policy.upkeep)):
+        for track in existence.absent_landmarks(
+            state.tracks, policy.upkeep, existence.count_misses(scan, policy.upkeep)
+        ):
             state.remove(track.id)
             report.removed += ((track.id, f"should be in view and was not seen, {round(track.missed)} scans in a row"),)
     if ids is None or None in ids:

@@ -46,7 +46,7 @@ def merge_seen(state: State, scan: ScanContext, policy: Policy) -> None:
 
 def _join(state: State, scan: ScanContext, names: Sequence[Id], odds: float) -> None:
     """Merge walls of which segments join, of those observed and others."""
-    while (found := wall_growth.agreeing(state.map, state.tracks, scan.channel, names, odds)) is not None:
+    while (found := wall_growth.find_coincident_wall(state.map, state.tracks, scan.channel, names, odds)) is not None:
         merged = _merge_pairs(state, scan, found)
         scan.report.merged += tuple(merged)
         if not merged:  # the map is full
@@ -63,13 +63,13 @@ def _merge_pairs(state: State, scan: ScanContext, found: merge.Merge) -> list[tu
     except MapError:
         return []
     others = f", with {len(found.pairs) - 1} others" if len(found.pairs) > 1 else ""
-    ordered = merge.order(state.tracks, found.pairs)
+    ordered = merge.order_pairs(state.tracks, found.pairs)
     for (kept, gone), d2, fused in zip(ordered, done.d2.tolist(), done.fused.tolist(), strict=True):
         if not fused:
             continue
         one, other = state.tracks.confirmed[kept], state.tracks.confirmed[gone]
         if isinstance(one.model, Joining):
-            one.extent = wall_growth.united(state.map, one, other)
+            one.extent = wall_growth.united_extent(state.map, one, other)
         state.tracks.merge(one, other)
         state.remove(gone)
         why = f"merged into {kept!r}: d2 {d2:.1f}, e^{found.ratio:.0f} times likelier than chance{others}"
@@ -107,7 +107,7 @@ def search_repeats(state: State, scan: ScanContext, policy: Policy) -> None:
     state.tracks.searched = state.tracks.changes
     found: list[Repeat] = []
     with suppress(np.linalg.LinAlgError):
-        found = of_map.repeats(state.map, state.tracks)
+        found = of_map.find_repeats(state.map, state.tracks)
     for repeat in found:
         if policy.upkeep.repeats == "merge" and repeat.sure and (repeat.agrees or _displace(state, scan, repeat)):
             merged = _merge_pairs(state, scan, merge.Merge(repeat.pairs, repeat.score))

@@ -8,7 +8,7 @@ from contextlib import suppress
 import numpy as np
 
 from kalmark.errors import EventError, MapError
-from kalmark.events import seconds
+from kalmark.events import seconds_text
 from kalmark.geometry.spaces import Rn
 from kalmark.report import Gap
 from kalmark.slam.held_control import MotionPart
@@ -45,7 +45,7 @@ def refuse_nowhere(state: State, name: str, parts: Sequence[MotionPart]) -> None
 
 
 def _nowhere(state: State, name: str, part: MotionPart) -> EventError:
-    what = f"{name!r} at t={seconds(state.t_ns or 0)} s"
+    what = f"{name!r} at t={seconds_text(state.t_ns or 0)} s"
     return EventError(f"{what}: u is {part.u.tolist()}, expected a control that moves it somewhere finite")
 
 

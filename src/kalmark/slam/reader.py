@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, ModelError
-from kalmark.events import Scan, when
+from kalmark.events import Scan, label_of_event
 from kalmark.filter.estimators import Estimator, Iterating, Update
 from kalmark.filter.map import Map
 from kalmark.geometry.gaussian import gate
@@ -32,7 +32,7 @@ def _time(event: Scan, k: int) -> int:
     try:
         return int((Decimal(str(name)) * 10**9).to_integral_value())
     except ArithmeticError:
-        raise EventError(f"{when(event)}: id {name!r}, expected the time in s of an earlier scan") from None
+        raise EventError(f"{label_of_event(event)}: id {name!r}, expected the time in s of an earlier scan") from None
 
 
 class StateReader:
@@ -81,10 +81,14 @@ class StateReader:
         """Return the noise R (1, p, p) of a reading, refusing what its sensor cannot have made.  Raises EventError."""
         if len(event.y) > 1 and self.keep == 1:
             name = type(self.sensor).__name__
-            raise EventError(f"{when(event)}: y has {len(event.y)} rows, expected one: a {name} measures its robot")
+            raise EventError(
+                f"{label_of_event(event)}: y has {len(event.y)} rows, expected one: a {name} measures its robot"
+            )
         odd = [i for i in event.ids or () if i not in (None, event.robot)]
         if odd and self.keep == 1:
-            raise EventError(f"{when(event)}: id {odd[0]!r}, expected none: {event.sensor!r} measures its robot")
+            raise EventError(
+                f"{label_of_event(event)}: id {odd[0]!r}, expected none: {event.sensor!r} measures its robot"
+            )
         return measurements(event, self.sensor, self.check)
 
     def begins_ns(self, event: Scan) -> list[int | None]:
@@ -95,7 +99,9 @@ class StateReader:
         begins = [_time(event, k) if self.is_loop(event, k) else self.t_ns for k in range(len(event.y))]
         last = [self.t_ns] if self.counts and self.keep == 1 else []
         if self.counts and any(t_ns is not None and (event.t_ns - t_ns) * 1e-9 < LEAST_S for t_ns in [*begins, *last]):
-            raise EventError(f"{when(event)}: {event.sensor!r} was read at that time already, expected one reading")
+            raise EventError(
+                f"{label_of_event(event)}: {event.sensor!r} was read at that time already, expected one reading"
+            )
         return begins
 
     def foresee(self, scans: Iterable[Scan]) -> None:

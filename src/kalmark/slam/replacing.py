@@ -61,7 +61,7 @@ class Replaced(NamedTuple):
     shift: Shift
 
 
-def replaced(pose: Array, P: Array, left_out: Sequence[RejectedFix]) -> Replaced | None:
+def pose_by_fixes(pose: Array, P: Array, left_out: Sequence[RejectedFix]) -> Replaced | None:
     """Return the new pose of a robot estimated at `pose` with covariance P; None where fixes do not determine it."""
     if len(left_out) < NEEDED:
         return None
@@ -101,7 +101,7 @@ def can_move(space: Space) -> bool:
     return space.world == "" or space.kinds[0] in (VECTOR, VECTOR3, ANCHOR)
 
 
-def moved(space: Space, x: Array, shift: Shift) -> tuple[Array, Array]:
+def shift_block(space: Space, x: Array, shift: Shift) -> tuple[Array, Array]:
     """Return a block's mean x (size,) after a motion of the world, and G (dof, d + 1) by that motion's error."""
     d, G = len(shift.t), np.zeros((space.dof, len(shift.t) + 1))
     if space.world == "":

@@ -29,7 +29,7 @@ from kalmark.events import Control, Event, Frame, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState, TimedNoise, coasts
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
-from kalmark.slam.held_control import noise_of
+from kalmark.slam.held_control import control_covariance
 from kalmark.slam.robot import Robot
 
 ZERO = ZeroVelocity2D | ZeroVelocity3D
@@ -109,7 +109,7 @@ class Source:
         return sensor.expect(self.still)[0][0, self.at], np.einsum("ij,jk,ik->i", E_p, own[1], E_p)
 
 
-def standing_of(sensor: Any, robot: Robot) -> Standing | None:
+def rest_detector(sensor: Any, robot: Robot) -> Standing | None:
     """Return the detector of rest of a `zero_velocity` sensor, None if it is another sensor.
 
     Raises ModelError if the robot has no input to it, or two such sensors.
@@ -148,7 +148,7 @@ class Standing:
         if source is None or isinstance(event, Frame) or (isinstance(event, Scan) and not len(event.y)):
             return None
         if isinstance(event, Control):
-            source.take(event.t_ns, event.u, noise_of(self.motion, event))
+            source.take(event.t_ns, event.u, control_covariance(self.motion, event))
         elif isinstance(event, Scan):
             plain = [k for k, name in enumerate(event.ids or (None,)) if name in (None, event.robot)]
             for k in plain:  # not what counts from an earlier scan

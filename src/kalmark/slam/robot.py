@@ -13,7 +13,7 @@ from kalmark.arrays import Array
 from kalmark.association.protocol import Association
 from kalmark.declare import parameters
 from kalmark.errors import ModelError
-from kalmark.events import MOST, ROUNDED, Scan, finite, is_writable, shown, unit_quaternion
+from kalmark.events import MOST, ROUNDED, Scan, finite, is_writable, short_text, unit_quaternion
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
@@ -26,10 +26,10 @@ from kalmark.models.protocols import (
     OfState,
     Sensor,
     parameter_covariance,
-    refuse_misspelt,
+    refuse_misspelt_names,
     refuse_other_views,
 )
-from kalmark.slam.checks import able, covariance, instance, refuse_odd_association
+from kalmark.slam.checks import check_covariance, instance, refuse_odd_association, require_methods
 from kalmark.slam.gaps import ACTIONS, Gaps
 from kalmark.tracks.channel import ROBUST
 from kalmark.tracks.front_ends import SearchingDetector
@@ -50,7 +50,7 @@ def _pose(value: Any, what: str, sizes: tuple[int, ...]) -> Array:
         pose = np.empty(0)
     unit = pose.shape == (7,) and abs(np.linalg.norm(pose[3:]) - 1) <= ROUNDED
     if pose.ndim != 1 or len(pose) not in sizes or (len(pose) == 7 and not unit):
-        raise ModelError(f"{what} is {shown(value)}, expected {' or '.join(WANTED[n] for n in sizes)}")
+        raise ModelError(f"{what} is {short_text(value)}, expected {' or '.join(WANTED[n] for n in sizes)}")
     if unit:
         pose[3:] = unit_quaternion(pose[3:])
     pose = finite(pose, what, error=ModelError)
@@ -83,17 +83,17 @@ class Mount:
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
-        refuse_misspelt(self.sensor, "Mount: sensor")
+        refuse_misspelt_names(self.sensor, "Mount: sensor")
         refuse_other_views(self.sensor, "Mount: sensor")
         if self.landmark is not None:
             instance(self.landmark, Landmark, "Mount: landmark", "a landmark model")
-            refuse_misspelt(self.landmark, "Mount: landmark")
+            refuse_misspelt_names(self.landmark, "Mount: landmark")
         if self.association is not None:
             refuse_odd_association(self.association, "Mount: association")
         if self.detector is not None:
             searches = isinstance(self.detector, SearchingDetector)
             one = "an object like km.detect.Trunks(), or a function"
-            able(self.detector, ("front_end" if searches else "__call__",), "Mount: detector", one)
+            require_methods(self.detector, ("front_end" if searches else "__call__",), "Mount: detector", one)
             declared = {own.name for own in parameters(type(self.detector))}
             if "signature" in declared and vars(self.detector)["signature"] is None:
                 chosen: Any = replace(self.detector, signature="signature" in self.sensor.columns)  # type: ignore[type-var]
@@ -106,7 +106,7 @@ class Mount:
             one_of: Any = (Delayed, Trilateration, Hypotheses)
             instance(self.initialization, one_of, "Mount: initialization", ways)
         if self.robust is not None:
-            what = f"Mount: robust is {shown(self.robust)}"
+            what = f"Mount: robust is {short_text(self.robust)}"
             if self.robust not in ROBUST:
                 raise ModelError(f"{what}, expected {' or '.join(ROBUST)}, or None")
             if isinstance(self.sensor, OfState):
@@ -115,7 +115,7 @@ class Mount:
 
     def covariance(self, dof: int, what: str) -> Array | None:
         """Return the covariance (dof, dof) of the mount in a robot's frame, or None if it is known exactly."""
-        return None if self.cov is None else covariance(self.cov, dof, what, definite=False, error=ModelError)
+        return None if self.cov is None else check_covariance(self.cov, dof, what, definite=False, error=ModelError)
 
     def block(self, what: str) -> tuple[Space, Array, Array] | None:
         """Return the space, the mean (size,) and the covariance (dof, dof) of this sensor's block, None if it has none.
@@ -154,22 +154,26 @@ class Robot:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise ModelError(f"Robot: name is {shown(self.name)}, expected a text that is not empty")
+            raise ModelError(f"Robot: name is {short_text(self.name)}, expected a text that is not empty")
         sensors = self.sensors if isinstance(self.sensors, Mapping) else ()
         for name in (self.name, *(name for name in sensors if isinstance(name, str))):
             if not is_writable(name):
-                raise ModelError(f"Robot: the name {shown(name)} has control characters or surrogates, expected none")
+                raise ModelError(
+                    f"Robot: the name {short_text(name)} has control characters or surrogates, expected none"
+                )
         what = f"robot {self.name!r}"
         if self.gaps not in ACTIONS:
-            raise ModelError(f"{what}: gaps is {shown(self.gaps)}, expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}")
+            raise ModelError(
+                f"{what}: gaps is {short_text(self.gaps)}, expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}"
+            )
         for key in ("max_speed_mps", "max_turn_radps"):
             limit = vars(self)[key]
             if limit is not None and not (isinstance(limit, int | float) and 0 < limit < math.inf):
-                raise ModelError(f"{what}: {key} is {shown(limit)}, expected a number > 0, or None")
+                raise ModelError(f"{what}: {key} is {short_text(limit)}, expected a number > 0, or None")
         if self.rests_until_ns is not None:
             instance(self.rests_until_ns, int, f"{what}: rests_until_ns", "a whole number, or None")
         instance(self.motion, Motion, f"{what}: motion", "a motion model")
-        refuse_misspelt(self.motion, f"{what}: motion")
+        refuse_misspelt_names(self.motion, f"{what}: motion")
         k = len(self.motion.columns)
         noise = np.shape(self.motion.control_noise(np.zeros(k)))
         if noise != (k, k):
@@ -177,7 +181,9 @@ class Robot:
         space = self.motion.space
         pose = 3 if space.kinds[:2] == SE2.kinds else 7 if space.kinds[:2] == SE3.kinds else 0
         if not pose:
-            raise ModelError(f"{what}: motion is in {getattr(space, 'name', shown(space))}, expected SE2, SE3 or more")
+            raise ModelError(
+                f"{what}: motion is in {getattr(space, 'name', short_text(space))}, expected SE2, SE3 or more"
+            )
         start = IDENTITY[pose] if self.start is None else self.start
         object.__setattr__(self, "start", _state(start, pose, space, f"{what}: start"))
         object.__setattr__(self, "sensors", _mounts(self.sensors, what, pose))
@@ -196,7 +202,7 @@ def robots_given(value: Any) -> list[Robot]:
     if isinstance(value, Robot):
         return [value]
     if isinstance(value, str) or not isinstance(value, Iterable):
-        raise ModelError(f"robots is {shown(value)}, expected a list of Robots")
+        raise ModelError(f"robots is {short_text(value)}, expected a list of Robots")
     robots = list(value)
     for robot in robots:
         instance(robot, Robot, "robots: one", "a Robot")
@@ -229,20 +235,20 @@ def _cov(value: Any, pose: int, space: Space, what: str) -> Array:
     given, dof = finite(value, what, MOST["m"] ** 2, ModelError), 3 if pose == 3 else 6
     size = dof if given.shape == (dof, dof) else space.dof
     cov = np.zeros((space.dof, space.dof))
-    cov[:size, :size] = covariance(given, size, what, definite=False, error=ModelError)
+    cov[:size, :size] = check_covariance(given, size, what, definite=False, error=ModelError)
     return cov
 
 
 def _mounts(sensors: Any, what: str, size: int) -> dict[str, Mount]:
     """Return a copy of a robot's sensors, by name; one at the robot's own origin is there in space too."""
     if not isinstance(sensors, Mapping):
-        raise ModelError(f"{what}: sensors is {shown(sensors)}, expected a mapping of names to Mounts")
+        raise ModelError(f"{what}: sensors is {short_text(sensors)}, expected a mapping of names to Mounts")
     for name, mount in sensors.items():
         if not isinstance(name, str) or not name:
-            raise ModelError(f"{what}: the name of a sensor is {shown(name)}, expected a text that is not empty")
+            raise ModelError(f"{what}: the name of a sensor is {short_text(name)}, expected a text that is not empty")
         if not isinstance(mount, Mount):
             raise ModelError(
-                f"{what}: sensor {name!r} is {shown(mount)}, expected a Mount: Mount(sensor, at=(x, y, heading))"
+                f"{what}: sensor {name!r} is {short_text(mount)}, expected a Mount: Mount(sensor, at=(x, y, heading))"
             )
     mounts = {}
     for name, mount in sensors.items():

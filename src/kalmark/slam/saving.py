@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.codec import NOT_FINITE, Reader, Writer, kind_of, place
+from kalmark.codec import NOT_FINITE, Reader, Writer, kind_of, place_in_record
 from kalmark.declare import class_of, class_of_file, classes
 from kalmark.errors import KalmarkError, MapError
 from kalmark.events import Id
 from kalmark.files import refuse_bomb, replace_file
 from kalmark.filter.map import Map
-from kalmark.filter.maps import restored as restored_map
+from kalmark.filter.maps import restore_map as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
-from kalmark.slam.alternative import Alternative, alone
-from kalmark.slam.description import Description, describe, model
+from kalmark.slam.alternative import Alternative, motion_of_alternative
+from kalmark.slam.description import Description, describe, describe_model
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.held_control import bias_block, bias_name
 from kalmark.slam.reader import StateReader
@@ -74,14 +74,14 @@ def members_of(state: State, head: Description) -> dict[str, bytes]:
         arrays.update({f"{prefix}{name}": array for name, array in map_.arrays()})
         return said | {"arrays": prefix}
 
-    writer = Writer({Map: map_said, Landmark: lambda of: _each(model(of), _to_text)})
+    writer = Writer({Map: map_said, Landmark: lambda of: _each(describe_model(of), _to_text)})
     said = head | {"columns": _columns(state.robots), "state": kind_of(State).write(writer, state)}
     arrays[NUMBERS] = writer.numbers()
     members = {DESCRIPTION: json.dumps(said, default=_plain, allow_nan=False).encode()}
     return members | {f"{name}.npy": _npy(array) for name, array in arrays.items()}
 
 
-def fill(state: State, members: dict[str, bytes], landmarks: Landmark | None = None) -> None:
+def fill_state(state: State, members: dict[str, bytes], landmarks: Landmark | None = None) -> None:
     """Fill a state as it is after construction with what `members_of` returned.
 
     `landmarks` is a type of the user's own, beside those of its sensors.  Raises MapError if the parts do not fit
@@ -95,7 +95,7 @@ def fill(state: State, members: dict[str, bytes], landmarks: Landmark | None = N
         return restored_map(says, lambda name, shape: _array(members, f"{says['arrays']}{name}", shape))
 
     def model_of(says: Description) -> Landmark:
-        return _landmark(says, own, world, place(reader))
+        return _landmark(says, own, world, place_in_record(reader))
 
     if said["columns"] != _columns(state.robots):
         raise MapError(f"columns of the motions are {_columns(state.robots)}, expected {said['columns']}")
@@ -107,7 +107,7 @@ def fill(state: State, members: dict[str, bytes], landmarks: Landmark | None = N
             raise MapError(f"slot of {track.id!r} is {track.slot}, expected one of {slots}")
     tracks.number()
     for name, other in _others(state):
-        other.moving = alone(state.moving[name])
+        other.moving = motion_of_alternative(state.moving[name])
     carried: dict[ChannelKey, Channel | StateReader] = {**state.channels, **state.readers}
     for key, channel in carried.items():
         channel.mount = tracks.slots.get(mount_name(*key), -1)
@@ -179,7 +179,7 @@ def load(path: Path, built: Callable[..., Any], robots: Iterable[Robot] | None, 
             given["robots"] = _same_robots([*robots], said["robots"])
         _refuse_own({name: each for name, each in said.items() if name not in given})
         slam = built(said, **given)
-        fill(slam.state, members, own)
+        fill_state(slam.state, members, own)
         return slam
 
 
@@ -281,7 +281,7 @@ def _to_number(value: Any) -> Any:
 def _landmark(said: Description, own: Sequence[Landmark], world: str, what: str) -> Landmark:
     """Return the model of a landmark: one of a user's `own`, or the registered one that is described."""
     like = [each for each in own if is_type(each, said)]
-    found = next((each for each in like if _each(model(each), _to_text) == said), None)
+    found = next((each for each in like if _each(describe_model(each), _to_text) == said), None)
     if said["type"] in classes("landmark") and found is None:
         given = {key: value for key, value in _each(said, _to_number).items() if key != "type"}
         made: Landmark = class_of("landmark", said["type"], world)(**given)
@@ -293,7 +293,7 @@ def _landmark(said: Description, own: Sequence[Landmark], world: str, what: str)
 
 def is_type(landmark: Landmark, description: Description | None) -> bool:
     """Return whether a landmark type is the one that was saved."""
-    return description is not None and model(landmark)["type"] == description["type"]
+    return description is not None and describe_model(landmark)["type"] == description["type"]
 
 
 def _refuse_own(said: Any, path: tuple[str, ...] = ()) -> None:
@@ -316,7 +316,7 @@ def _same_robots(given: list[Any], saved: Description) -> list[Robot]:
         raise MapError(f"robots are {got}, expected {names}")
     for robot in given:
         for what, mine, expected in (
-            ("motion is", model(robot.motion)["type"], saved[robot.name]["motion"]["type"]),
+            ("motion is", describe_model(robot.motion)["type"], saved[robot.name]["motion"]["type"]),
             ("sensors are", sorted(robot.sensors), sorted(saved[robot.name]["sensors"])),
         ):
             if mine != expected:

@@ -26,7 +26,7 @@ from kalmark.association import Association, ByIdentity
 from kalmark.association.averaging import refuse_averaging
 from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
-from kalmark.association.ratio import accepted
+from kalmark.association.ratio import defer_doubtful_pairs
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.events import (
     LONGEST_PAUSE_S,
@@ -38,24 +38,24 @@ from kalmark.events import (
     Scan,
     checked_id,
     kind_of,
-    listed,
-    seconds,
-    when,
+    label_of_event,
+    list_names,
+    seconds_text,
 )
 from kalmark.filter.estimators import CompilingEstimator, Estimator, Invariant
 from kalmark.geometry.spaces import RHO
 from kalmark.management import reparametrize as points
-from kalmark.management.attention import left_out
+from kalmark.management.attention import reasons_against_start
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
 from kalmark.models.protocols import Landmark, UnknownDepth
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import by_ids, locating, maintenance, moves, starting, state_corrections, tentative
-from kalmark.slam.checks import covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
-from kalmark.slam.checks import numbers as checked_numbers
+from kalmark.slam.checks import check_covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
+from kalmark.slam.checks import check_numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
-from kalmark.slam.held_readings import again
+from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy, refuse_other_world
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.robot import Robot, robots_given
@@ -113,9 +113,11 @@ class Slam(Estimate):
 
     def __repr__(self) -> str:
         state = self.state
-        when_ = "before its first event" if state.t_ns is None else f"at t={seconds(state.t_ns)} s"
+        when_ = "before its first event" if state.t_ns is None else f"at t={seconds_text(state.t_ns)} s"
         size, said = len(state.tracks.confirmed) + len(state.tracks.known), type(state.estimator).__name__
-        return f"<Slam of {listed(state.robots)} {when_}: {size} landmarks, {said}, {type(self.association).__name__}>"
+        return (
+            f"<Slam of {list_names(state.robots)} {when_}: {size} landmarks, {said}, {type(self.association).__name__}>"
+        )
 
     # ------------------------------------------------------------------ events
     def process(self, event: Event) -> Report:
@@ -128,10 +130,10 @@ class Slam(Estimate):
             raise EventError(f"got {type(event).__name__}, expected a Control, a Scan, a Frame or a Fix")
         before = state.t_ns
         if before is not None and event.t_ns < before:
-            raise EventError(f"{when(event)} comes after one at t={seconds(before)} s")
+            raise EventError(f"{label_of_event(event)} comes after one at t={seconds_text(before)} s")
         if event.robot not in state.robots:
             names = sorted(state.robots)
-            raise EventError(f"{when(event)}: robot is {event.robot!r}, expected one of {names}")
+            raise EventError(f"{label_of_event(event)}: robot is {event.robot!r}, expected one of {names}")
         if before is not None and event.t_ns - before > self.state.settings.longest_pause_s * 1e9:
             self._refuse_ahead(event, before)
         try:
@@ -139,7 +141,7 @@ class Slam(Estimate):
             if not isinstance(event, Frame):
                 state.settle()
             if event.robot in state.standing:
-                report.standing = state_corrections.stood(state, event)
+                report.standing = state_corrections.correct_by_rest(state, event)
             if event.t_ns != before:
                 self.state.taken.clear()
                 self._ahead = []
@@ -151,7 +153,7 @@ class Slam(Estimate):
         except np.linalg.LinAlgError as error:
             state.refuse_lost(event)
             why = " ".join(str(error).split())
-            raise DivergedError(f"{when(event)}: {why}; {CURE}") from error
+            raise DivergedError(f"{label_of_event(event)}: {why}; {CURE}") from error
 
     def _refuse_ahead(self, event: Event, before: int) -> None:
         """Refuse an event that comes longer after the last one than any pause lasts, but not the tenth in a row."""
@@ -161,8 +163,9 @@ class Slam(Estimate):
         self._ahead.append(event.t_ns)
         if len(self._ahead) < IN_A_ROW:
             raise EventError(
-                f"{when(event)} comes {(event.t_ns - before) * 1e-9:.6g} s after one at t={seconds(before)} s, "
-                f"expected at most {longest_s:g} s (longest_pause_s), or {IN_A_ROW} such events in a row"
+                f"{label_of_event(event)} comes {(event.t_ns - before) * 1e-9:.6g} s after one at "
+                f"t={seconds_text(before)} s, expected at most {longest_s:g} s (longest_pause_s), "
+                f"or {IN_A_ROW} such events in a row"
             )
 
     def has_taken(self, event: Event) -> bool:
@@ -190,7 +193,7 @@ class Slam(Estimate):
         state = self.state
         key = event.robot, event.sensor
         if key in state.readers:
-            return state_corrections.read(state, event, state.readers[key])
+            return state_corrections.correct_by_reading(state, event, state.readers[key])
         policy = self._policy(event)
         return self._found(event if policy.detector is None else policy.detector(event))
 
@@ -199,7 +202,7 @@ class Slam(Estimate):
         if isinstance(detector, SearchingDetector):
             return self._searched(event, state.front_ends[event.robot, event.sensor])
         if not isinstance(detector, FrameDetector):
-            raise EventError(f"{when(event)}: {event.sensor!r} has no detector for images, expected one")
+            raise EventError(f"{label_of_event(event)}: {event.sensor!r} has no detector for images, expected one")
         return self._found(detector.scan_of(event))
 
     def _searched(self, event: Frame, front_end: FrontEnd) -> Report:
@@ -211,16 +214,16 @@ class Slam(Estimate):
         beside = event.right_grey() if pair else event.depths() if channel.finds_depth else None
         if beside is not None and beside.shape != image.shape:
             what = "right image is" if pair else "depths are"
-            raise EventError(f"{when(event)}: the {what} {beside.shape}, expected {image.shape} as the image")
+            raise EventError(f"{label_of_event(event)}: the {what} {beside.shape}, expected {image.shape} as the image")
         state.t_ns = event.t_ns
         gaps = moves.advance(state, event.robot)
         again = front_end.recognised(image, state.map, state.tracks, channel)
         if again is not None:
-            locating.placed_again(state, channel, event.robot, *again)
+            locating.relocate_robot(state, channel, event.robot, *again)
         prospect = front_end.prospect_of(state.map, state.tracks, channel, event.robot)
         scan, removed, drifted = front_end.search(event, image, prospect, beside)
         if drifted is not None:
-            locating.widened(state, event.robot, *drifted)
+            locating.inflate_covariance(state, event.robot, *drifted)
         for name, _ in removed:
             state.remove(name)
         report = self._found(scan)
@@ -255,7 +258,7 @@ class Slam(Estimate):
         policy = self.state.policies.get((event.robot, event.sensor))
         if policy is None:
             names = sorted(self.state.robots[event.robot].sensors)
-            raise EventError(f"{when(event)}: sensor is {event.sensor!r}, expected one of {names}")
+            raise EventError(f"{label_of_event(event)}: sensor is {event.sensor!r}, expected one of {names}")
         return policy
 
     def _found(self, event: Scan) -> Report:
@@ -263,11 +266,15 @@ class Slam(Estimate):
         state = self.state
         key = event.robot, event.sensor
         channel, policy = state.channels[key], state.policies[key]
-        if policy.by_ids and self.before_scan is None and (done := by_ids.corrected(state, event, channel, policy)):
+        if (
+            policy.by_ids
+            and self.before_scan is None
+            and (done := by_ids.correct_by_ids(state, event, channel, policy))
+        ):
             return done
         if event.ids is not None and not state.inner.isdisjoint(event.ids):
             name = next(i for i in event.ids if i in state.inner)
-            raise EventError(f"{when(event)}: id {name!r} names a robot's bias or mount, expected another")
+            raise EventError(f"{label_of_event(event)}: id {name!r} names a robot's bias or mount, expected another")
         R = measurements(event, channel.sensor, channel.check)
         if policy.averages:
             refuse_averaging(state.map, state.estimator, event)
@@ -281,7 +288,7 @@ class Slam(Estimate):
             state.map, state.tracks, state.clones, state.estimator, channel, robot, event, ids, R, report
         )  # fmt: skip
         if len(event.y) and state.repeats(key, event.t_ns, event.y, event.ids):
-            return again(report, ids, channel.dof)
+            return record_repeated_reading(report, ids, channel.dof)
         why = state.look_back(key) if channel.sees_velocity else ""
         if self.before_scan is not None and not why:
             self.before_scan(event.robot, event.sensor)
@@ -307,7 +314,7 @@ class Slam(Estimate):
         """Correct by the known landmarks, then add the new ones.  [S] 2.4."""
         state = self.state
         query = Query(scan)
-        located = locating.started(state, scan, query)
+        located = locating.locate_in_known_map(state, scan, query)
         if located is not None and located.T is None:
             if not located.fates:
                 scan.report.blank(scan.channel.dof)
@@ -315,7 +322,7 @@ class Slam(Estimate):
             scan.report.observations = located.fates or waits
             return
         if located is None:
-            query, decisions = locating.decided(state, scan, query, lambda query: self._decided(policy, query))
+            query, decisions = locating.decide(state, scan, query, lambda query: self._decided(policy, query))
         else:
             query = Query(scan)
             decisions = self._decided(policy, query, located.decisions)
@@ -323,11 +330,11 @@ class Slam(Estimate):
         names = [name for name, _ in decisions]
         groups = state.tracks.by_model(scan.channel, names, scan.event.robot)
         exact = correct_by_known(state, scan, policy, decisions) if state.tracks.known else []
-        again = starting.left_open(state, scan, groups, decisions) if policy.restarts else []
+        again = starting.take_open_rays(state, scan, groups, decisions) if policy.restarts else []
         judged, found = correct(state, scan, policy, groups, decisions)
         judged = exact + judged
         if state.sums:
-            locating.weighed(state, scan, judged)
+            locating.compare_alternatives(state, scan, judged)
         if again:
             found = found + starting.restart(state, scan, again, decisions)
         if not found and not policy.reviews and sum(len(group.rows) for group in judged) == len(decisions):
@@ -347,7 +354,7 @@ class Slam(Estimate):
         """Return the association's decisions, or those `given`; where its matrices are singular, only ids are used."""
         try:
             decisions = policy.association.associate(query) if given is None else given
-            return accepted(query, decisions, policy.upkeep.odds) if policy.holds_back else decisions
+            return defer_doubtful_pairs(query, decisions, policy.upkeep.odds) if policy.holds_back else decisions
         except np.linalg.LinAlgError:
             return [(None, SINGULAR) if i is None else (i, "") for i in query.ids]
 
@@ -358,7 +365,7 @@ class Slam(Estimate):
         """Decide what becomes of the observations of no landmark: tentative, pending, new, or left alone."""
         state = self.state
         new = [k for k in range(len(decisions)) if k not in seen]
-        confirmed = tentative.compare(state, scan, policy, new, decisions, seen)
+        confirmed = tentative.confirm_tentative(state, scan, policy, new, decisions, seen)
         left = [k for k in new if k not in seen and k not in confirmed]
         for o in starting.start_delayed(state, scan, policy, left, decisions):
             seen[o.index] = o
@@ -369,7 +376,7 @@ class Slam(Estimate):
             for o in found + [o for group in judged for o in outcomes_of(group)]:
                 seen[o.index] = o._replace(outcome="new", reason=by_name[o.index][1])
         new = [k for k in new if k not in seen]
-        reasons = left_out(scan, policy.attention, policy.starts, new, known, decisions)
+        reasons = reasons_against_start(scan, policy.attention, policy.starts, new, known, decisions)
         for k in new:
             name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
             seen[k] = starting.initialize(state, scan, policy, k, name, reason)
@@ -396,14 +403,14 @@ class Slam(Estimate):
         if landmark is not None:
             instance(landmark, Landmark, f"landmark {name!r}", "a landmark model")
         default = next((channel.landmark for channel in state.channels.values()), Point2D())
-        model = landmark or points.surveyed(default, mean)
+        model = landmark or points.surveyed_type(default, mean)
         refuse_other_world(state.robots, model.kind, model.space.world)
         if state.is_there(name) or name in state.inner:
             what = "names a robot's bias or mount" if name in state.inner else "is in the map already"
             raise MapError(f"landmark {name!r} {what}, expected a new id")
         mean = checked_numbers(mean, model.space.size, f"landmark {name!r}: mean", MapError)
         if cov is not None:
-            cov = covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
+            cov = check_covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         state.settle()
         for front_end in state.front_ends.values():
             front_end.survey(name)
@@ -486,5 +493,5 @@ def _copied(robots: list[Robot], settings: Settings, members: dict[str, bytes]) 
     from kalmark.slam import saving
 
     slam = Slam(robots, **vars(settings))
-    saving.fill(slam.state, members)
+    saving.fill_state(slam.state, members)
     return slam

@@ -69,7 +69,7 @@ def _initialized(state: State, scan: ScanContext, policy: Policy, k: int, name: 
     return Observation(k, None, "tentative", name, None, why)
 
 
-def left_open(
+def take_open_rays(
     state: State, scan: ScanContext, groups: list[tuple[ObservationModel, list[int]]], decisions: Sequence[Decision]
 ) -> list[int]:  # fmt: skip
     """Return the observations of rays whose depth a mount leaves open, and take them out of the groups to be fused."""
@@ -78,7 +78,7 @@ def left_open(
         slots = state.tracks.slots_of([decisions[k][0] for k in rows])
         found += [
             k
-            for k, is_open in zip(rows, baselines.left_open(scan, model, slots, rows).tolist(), strict=True)
+            for k, is_open in zip(rows, baselines.rays_without_baseline(scan, model, slots, rows).tolist(), strict=True)
             if is_open
         ]
         rows[:] = [k for k in rows if k not in found]
@@ -187,14 +187,14 @@ def start_delayed(
         return [Observation(k, i, "ignored", None, None, str(full)) for k, i in ids.items()]
     made = {k: scan.measurement(k, clone) for k in ids}
     try:
-        candidates, best = delayed.joined(scan, way, state.tracks.candidates.get(key, []), made, ids)
+        candidates, best = delayed.extend_candidates(scan, way, state.tracks.candidates.get(key, []), made, ids)
     except np.linalg.LinAlgError:
         state.release(key)
         return [Observation(k, i, "ignored", None, None, SINGULAR) for k, i in ids.items()]
     found = []
     for k, i in ids.items():
         try:
-            outcome, name = delayed.started(scan, way, candidates, best[k]), None
+            outcome, name = delayed.start_landmark(scan, way, candidates, best[k]), None
         except np.linalg.LinAlgError:
             found.append(Observation(k, i, "deferred", None, None, SINGULAR))
             continue
@@ -208,7 +208,7 @@ def start_delayed(
                 name = state.tracks.new_name() if best[k].name is None else best[k].name
                 assert name is not None
                 state.tracks.confirm(Track(name, scan.channel.landmark, slot), len(outcome.used.measurements))
-                candidates = delayed.unexplained(scan, candidates, outcome.used, slot)
+                candidates = delayed.drop_explained(scan, candidates, outcome.used, slot)
         found.append(Observation(k, i, "deferred" if name is None else "new", name, None, reason))
     for number in state.clones.of(key)[: -way.poses]:
         candidates = delayed.without_clone(scan, candidates, number)

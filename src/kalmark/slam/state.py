@@ -10,10 +10,10 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.association import Association
 from kalmark.errors import DivergedError, MapError, ModelError
-from kalmark.events import Event, Id, when
+from kalmark.events import Event, Id, label_of_event
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.filter.map import Map
-from kalmark.filter.maps import DENSE, grown, new_map
+from kalmark.filter.maps import DENSE, compress_if_large, new_map
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
@@ -24,7 +24,7 @@ from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import SELDOM, LastMeasurement
 from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, policy_of, refuse_other_world
 from kalmark.slam.reader import LEAST_S, StateReader
-from kalmark.slam.rests import standing_of
+from kalmark.slam.rests import rest_detector
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
@@ -125,7 +125,7 @@ class State:
                 self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
             if isinstance(mount.sensor, OfState):
                 refuse_other_world(self.robots, type(mount.sensor).__name__, world_of(mount.sensor))
-                standing = standing_of(mount.sensor, robot)
+                standing = rest_detector(mount.sensor, robot)
                 if standing is not None:
                     self.standing[robot.name] = name
                 self.readers[robot.name, name] = StateReader(mount.sensor, robot.motion, mount.at, mount_slot, standing)
@@ -237,7 +237,7 @@ class State:
         """Compress the map from so many landmarks on that it pays; not where matchings are averaged."""
         if self.may_grow and len(self.tracks.confirmed) > DENSE:
             spaces = (track.model.space for track in self.tracks.confirmed.values())
-            self.map = grown(self.map, spaces, self.settings.numbers)
+            self.map = compress_if_large(self.map, spaces, self.settings.numbers)
 
     def is_there(self, name: Id) -> bool:
         """Return whether a name is that of a block, or of a landmark known exactly."""
@@ -254,4 +254,4 @@ class State:
         """Raise DivergedError if the covariance of an event's robot is none: no measurement can bring it back."""
         fault = fault_of(self.map.covariance([self.moving[event.robot].slot]))
         if fault:
-            raise DivergedError(f"{when(event)}: the covariance of {event.robot!r} {fault}; {CURE}")
+            raise DivergedError(f"{label_of_event(event)}: the covariance of {event.robot!r} {fault}; {CURE}")

@@ -14,9 +14,9 @@ from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.observe import fix_view
 from kalmark.report import JudgedScan, Observation, Report, outcomes_of
 from kalmark.slam import moves, replacing
-from kalmark.slam.alternative import Alternative, put
+from kalmark.slam.alternative import Alternative, write_robot
 from kalmark.slam.checks import refuse_bad_fix
-from kalmark.slam.held_readings import again
+from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.reader import StateReader
 from kalmark.slam.state import State
 
@@ -24,7 +24,7 @@ ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes stay within
 
 
-def read(state: State, event: Scan, reader: StateReader) -> Report:
+def correct_by_reading(state: State, event: Scan, reader: StateReader) -> Report:
     """Correct by what a sensor measures of its own robot; leave a clone where its next readings count from here."""
     key, R, report = (event.robot, event.sensor), reader.noise(event), Report(event, event.y)
     begins = reader.begins_ns(event)
@@ -33,7 +33,7 @@ def read(state: State, event: Scan, reader: StateReader) -> Report:
     if not len(event.y) and reader.keep == 1:
         return report
     if not reader.counts and state.repeats(key, event.t_ns, event.y):
-        return again(report, [None] * len(event.y), R.shape[1], event.robot)
+        return record_repeated_reading(report, [None] * len(event.y), R.shape[1], event.robot)
     other = state.alternatives.get(event.robot)
     sum_ = state.sums.get(event.robot)
     others = [*([] if other is None else [other]), *([] if sum_ is None else sum_.all())]
@@ -60,7 +60,7 @@ def read(state: State, event: Scan, reader: StateReader) -> Report:
         if done.fused[0] and not is_loop:
             reader.take(event.y[k : k + 1], done.Z, since_s)
         if reader.is_position:
-            report.replaced = _believed(state, event.robot, event.y[0], R[0], done, fits)
+            report.replaced = _record_position(state, event.robot, event.y[0], R[0], done, fits)
     report.observations = found
     if reader.counts:
         kept: list[int] = []
@@ -73,7 +73,7 @@ def read(state: State, event: Scan, reader: StateReader) -> Report:
     return report
 
 
-def stood(state: State, event: Event) -> Observation | None:
+def correct_by_rest(state: State, event: Event) -> Observation | None:
     """Correct by a velocity of zero where a robot is detected to stand at the end of an event."""
     key = event.robot, state.standing[event.robot]
     reader = state.readers[key]
@@ -81,7 +81,7 @@ def stood(state: State, event: Event) -> Observation | None:
     stands = reader.standing.take(event, lambda *sensor: state.readers[sensor].constants(state.map))
     if stands and reader.t_ns != event.t_ns:
         zero = Scan(t_ns=event.t_ns, robot=key[0], sensor=key[1], y=np.zeros((1, len(reader.sensor.columns))))
-        return read(state, zero, reader).observations[0]
+        return correct_by_reading(state, zero, reader).observations[0]
     if stands is False:
         for slot in state.clones.refer(key, ()):  # from where a robot that moves now was
             state.map.remove(slot)
@@ -97,7 +97,7 @@ def fix(state: State, event: Fix) -> Report:
     slot, report = state.moving[event.robot].slot, Report(event, event.y.reshape(1, size))
     report.gaps = gaps
     if state.repeats((event.robot, ""), event.t_ns, report.y):
-        return again(report, [event.robot], size, event.robot)
+        return record_repeated_reading(report, [event.robot], size, event.robot)
     gate, R = state.settings.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
     update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
     estimator, other = state.estimator.for_fixes(), state.alternatives.get(event.robot)
@@ -107,11 +107,11 @@ def fix(state: State, event: Fix) -> Report:
     done = state.corrected(update, event, estimator)
     report.e, report.z, report.Z = done.e, done.z, done.Z
     report.judged = (JudgedScan([0], [event.robot], [event.robot], done, gate),)
-    report.replaced = _believed(state, event.robot, event.y, event.cov, done, fits)
+    report.replaced = _record_position(state, event.robot, event.y, event.cov, done, fits)
     return report
 
 
-def _believed(state: State, name: str, y: Array, R: Array, done: Correction, fits: bool) -> float:
+def _record_position(state: State, name: str, y: Array, R: Array, done: Correction, fits: bool) -> float:
     """Take note whether a position y (d,) of noise R (d, d) fitted; return how far, m, it moved the robot, 0 if not.
 
     Where none has determined yet where the map is, the first that agree do.  Later they may be wrong: then the robot
@@ -128,15 +128,15 @@ def _believed(state: State, name: str, y: Array, R: Array, done: Correction, fit
     moving.left_out.append(replacing.RejectedFix(y, R, done.e[0, : len(y)]))
     size, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
     mean = state.map.mean(moving.slot)
-    found = replacing.replaced(mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out)
+    found = replacing.pose_by_fixes(mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out)
     if state.placed < replacing.NEEDED and found is not None:
         blocks = _blocks(state)
         if len(state.robots) == 1 and all(replacing.can_move(space) for _, space in blocks):
             _move(state, blocks, found.shift)
         else:
-            put(state.map, moving.slot, found.pose, found.cov)
+            write_robot(state.map, moving.slot, found.pose, found.cov)
     elif other is not None and fits and other.explains(state.t_ns):
-        put(state.map, moving.slot, other.map.mean(moving.slot), other.map.covariance([moving.slot]))
+        write_robot(state.map, moving.slot, other.map.mean(moving.slot), other.map.covariance([moving.slot]))
     else:
         _doubt(state, name, found, done, R, fits)
         return 0.0
@@ -162,7 +162,7 @@ def _doubt(state: State, name: str, found: replacing.Replaced | None, done: Corr
     if found is None:
         other.widen(done.z[0], done.Z[0], R)
     else:
-        put(other.map, other.moving.slot, found.pose, found.cov)
+        write_robot(other.map, other.moving.slot, found.pose, found.cov)
 
 
 def _blocks(state: State) -> list[tuple[int, Space]]:
@@ -177,7 +177,7 @@ def _blocks(state: State) -> list[tuple[int, Space]]:
 
 def _move(state: State, blocks: list[tuple[int, Space]], shift: replacing.Shift) -> None:
     """Move the whole map; its covariance becomes P + G C G', C of the motion.  Once in a run: O(n^3)."""
-    found = [replacing.moved(space, state.map.mean(slot), shift) for slot, space in blocks]
+    found = [replacing.shift_block(space, state.map.mean(slot), shift) for slot, space in blocks]
     rows = state.rows(tuple((slot, space.dof) for slot, space in blocks))
     G = np.concatenate([G_block for _, G_block in found])
     state.map.predict(rows, np.eye(len(rows)), G @ shift.cov @ G.T)

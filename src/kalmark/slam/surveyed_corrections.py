@@ -39,7 +39,7 @@ def is_tried(state: State, robot: str, names: Sequence[Any]) -> bool:
     return bool(state.surveys.strangers.get(robot)) or (bool(trial) and not trial.isdisjoint(names))
 
 
-def corrected(
+def correct_by_surveys(
     state: State, scan: ScanContext, names: Sequence[Any], update: Update, least: float,
     estimator: Estimator, approach: Callable[[Sequence[int], float], bool],
 ) -> Correction:  # fmt: skip

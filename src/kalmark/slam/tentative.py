@@ -34,7 +34,7 @@ WITHIN = 0.9999  # of right sightings fit
 ELSEWHERE = "its first sightings are outliers: it is where the later ones have it"
 
 
-def compare(state: State, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision],
+def confirm_tentative(state: State, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision],
     seen: dict[int, Observation],
 ) -> dict[int, tuple[Id, str]]:  # fmt: skip
     """Count the observations of tentative landmarks; return those that confirm one, which is one from here on."""
@@ -42,7 +42,7 @@ def compare(state: State, scan: ScanContext, policy: Policy, new: list[int], dec
     rows = [k for k in new if decisions[k][0] in policy.starts]
     lost = np.array([decisions[k][0] is REMAP for k in rows], dtype=np.bool_)
     try:
-        matches, others = confirm.matched(scan, policy.association, rows, lost)
+        matches, others = confirm.match_tentative(scan, policy.association, rows, lost)
     except np.linalg.LinAlgError:
         seen |= {k: Observation(k, None, "ignored", None, None, SINGULAR) for k in rows}
         return {}
@@ -53,7 +53,7 @@ def compare(state: State, scan: ScanContext, policy: Policy, new: list[int], dec
         track, u = state.tracks.tentative[match.name], policy.upkeep
         track.hits, track.chances, track.unseen = track.hits + 1, track.chances + 1, -1
         if scan.channel.joins:
-            track.extent = wall_growth.grown(scan, [track], [match.k])[0]
+            track.extent = wall_growth.extend_extents(scan, [track], [match.k])[0]
         if u.confirms(track.hits):
             confirmed[match.k] = match.name, f"confirmed: seen in {track.hits} of {track.chances} scans"
             _confirm(state, scan, track)
@@ -78,7 +78,7 @@ def _confirm(state: State, scan: ScanContext, track: Track) -> None:
     for m in track.measurements:
         channel, clone = state.channels[m.robot, m.sensor], state.clones[m.clone]
         try:
-            start, R = confirm.residual(state.map, state.estimator, channel, clone, track, m)
+            start, R = confirm.measurement_difference(state.map, state.estimator, channel, clone, track, m)
             slot = state.add(start)
         except np.linalg.LinAlgError:
             continue
@@ -189,7 +189,7 @@ def drop(state: State, scan: ScanContext, policy: Policy) -> None:
     for name in mine:
         tentative[name].unseen += 1
     missed = [name for name in mine if tentative[name].unseen]
-    for name in confirm.in_view(scan, missed):
+    for name in confirm.tentative_in_view(scan, missed):
         tentative[name].chances += 1
     for name in missed:
         track = tentative[name]

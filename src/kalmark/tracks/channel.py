@@ -21,8 +21,8 @@ from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
 from kalmark.models.known_view import known_view
 from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
-from kalmark.models.observe import composed, is_built_in, landmark_at, linearize, view_of
-from kalmark.models.protocols import Landmark, Sensor, finds_depth, of_pair, sees_kinds
+from kalmark.models.observe import is_built_in, landmark_at, linearize, sensor_pose, view_of
+from kalmark.models.protocols import Landmark, Sensor, finds_depth, has_second_camera, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
 from kalmark.models.velocity_view import moving_view_of, velocity_of
 
@@ -81,7 +81,7 @@ class ObservationModel:
         self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
-        run = corrections.compiled_compared if isinstance(self.model, tuple) else corrections.compared
+        run = corrections.compiled_compared if isinstance(self.model, tuple) else corrections.innovation_covariances
         scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), math.inf
         return run(self.model, m.whole, scan)
 
@@ -89,7 +89,7 @@ class ObservationModel:
         self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array, how: str
     ) -> Array:  # fmt: skip
         """Return the noise (K, p, p) with which outliers count less, `how` one of `ROBUST`."""
-        run = corrections.compiled_weighed if isinstance(self.model, tuple) else corrections.weighed
+        run = corrections.compiled_weighed if isinstance(self.model, tuple) else corrections.robust_noise
         k = DEGREES if how == STUDENT else huber_length(R.shape[1])
         scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), k
         return np.asarray(run(self.model, m.whole, scan, how == STUDENT))
@@ -138,7 +138,7 @@ class Channel:
         self.clone, self.since = -1, np.zeros(1 + held)
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
-        self.of_pair = of_pair(sensor)
+        self.of_pair = has_second_camera(sensor)
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
         self.models = self._models(others)
         self.kinds = frozenset(self.models)
@@ -251,7 +251,7 @@ class Channel:
 
     def composed(self, map_: Map, robot: int) -> tuple[Array, Array, Array]:
         """Return the sensor's pose T (3,) or (7,) in the map's frame, T_r and T_s (dof, dof)."""
-        return composed(*self.split(self.observer(map_, robot))[:2])
+        return sensor_pose(*self.split(self.observer(map_, robot))[:2])
 
     def pose(self, map_: Map, robot: int) -> Array:
         """Return the sensor's pose T, (3,) or (7,), in the map's frame."""
@@ -277,7 +277,7 @@ class Channel:
         """Return the indices (K,) of the `slots` in view; `extents` are the segments (2,) of lines, or None."""
         T, l = self.pose(map_, robot), map_.means(np.array(slots), model.d)
         if not isinstance(model.landmark, protocols.Segmented):
-            return np.flatnonzero(self.sensor.sees(in_frame(model.landmark, T, l)))
+            return np.flatnonzero(self.sensor.sees(landmarks_in_frame(model.landmark, T, l)))
         ends = [model.landmark.first_ends if t is None else t for t in extents]
         p, _ = model.landmark.endpoints(l, np.array(ends))
         return np.flatnonzero(self.sensor.sees_segments(T, p[:, 0], p[:, 1])[0])
@@ -333,7 +333,7 @@ class Channel:
         return l[0], L_h, kernels.quadratic(L_y[0], np.array(R, dtype=np.float64)) + prior[0]
 
 
-def in_frame(landmark: Landmark, T: Array, l: Array) -> Array:
+def landmarks_in_frame(landmark: Landmark, T: Array, l: Array) -> Array:
     """Return landmarks l (K, n) in the frame T, v (K, d) as `sees` takes them."""
     v = landmark.seen_from(T, l)[0]
     if isinstance(landmark, InverseDepth2D):  # a ray, as long as rho times the distance

@@ -17,9 +17,9 @@ from kalmark.events import Id
 from kalmark.filter.map import AT_ONCE, Map
 from kalmark.filter.observed_block import innovation, observed_block
 from kalmark.models import protocols
-from kalmark.models.observe import composed, linearize
+from kalmark.models.observe import linearize, sensor_pose
 from kalmark.report import Expectations
-from kalmark.tracks.channel import Channel, ObservationModel, in_frame
+from kalmark.tracks.channel import Channel, ObservationModel, landmarks_in_frame
 from kalmark.tracks.track import Track, Tracks
 
 QUATERNION_AT = 6  # where the w of a pose is
@@ -58,19 +58,19 @@ def expectations(
         rows = np.array(group)
         slots = tracks.slots_of([names[i] for i in group])
         of = [tracks.confirmed.get(names[i]) for i in group]
-        seen = looked(map_, channel, slot, model, slots, of, reasons=not only_in_view)
+        seen = visible_blocks(map_, channel, slot, model, slots, of, reasons=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):
             why[i] = reason
         in_view[rows] = seen.in_view
         chosen = np.flatnonzero(seen.in_view) if only_in_view else np.arange(len(rows))
         for at in range(0, len(chosen), AT_ONCE):  # a joint marginal is dense
             some = chosen[at : at + AT_ONCE]
-            found.append((rows[some], linearised(map_, channel, slot, model, slots[some], seen.y[some])))
+            found.append((rows[some], linearize_blocks(map_, channel, slot, model, slots[some], seen.y[some])))
     for model, group in tracks.known_by_model(channel, names):
         rows, known = np.array(group), [names[i] for i in group]
         l = tracks.known.means(known)
         extents = [tracks.known.extent(name) for name in known]
-        seen = look(channel, model, channel.pose(map_, slot), l, extents, reasons=not only_in_view)
+        seen = visible_landmarks(channel, model, channel.pose(map_, slot), l, extents, reasons=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):
             why[i] = reason
         in_view[rows] = seen.in_view
@@ -127,17 +127,19 @@ def _not_observed(channel: Channel, tracks: Tracks, name: Id, robot: str) -> str
 
 
 # ---------------------------------------------------------------------- in view
-def looked(
+def visible_blocks(
     map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, tracks: Sequence[Track | None],
     reasons: bool = True,
 ) -> Looked:  # fmt: skip
     """Return which blocks of a kind are in view, and measurements to linearise at; `reasons`: why others are not."""
     T, l = channel.pose(map_, robot), map_.means(slots, model.d)
     sizes = [None if track is None else track.size_m for track in tracks]
-    return look(channel, model, T, l, [None if track is None else track.extent for track in tracks], sizes, reasons)
+    return visible_landmarks(
+        channel, model, T, l, [None if track is None else track.extent for track in tracks], sizes, reasons
+    )
 
 
-def look(
+def visible_landmarks(
     channel: Channel, model: ObservationModel, T: Array, l: Array, extents: Sequence[Array | None],
     sizes: Sequence[float | None] = (), reasons: bool = True,
 ) -> Looked:  # fmt: skip
@@ -153,7 +155,7 @@ def look(
         p, _ = model.landmark.endpoints(l, t)
         in_view, y = sensor.sees_segments(T, np.ascontiguousarray(p[:, 0]), np.ascontiguousarray(p[:, 1]))
         return Looked(in_view, ["" if seen else "no part of its segment is in the image" for seen in in_view], y)
-    v = in_frame(model.landmark, T, l)
+    v = landmarks_in_frame(model.landmark, T, l)
     in_view = sensor.sees(v) if isinstance(sensor, protocols.Visible) else np.ones(len(v), dtype=np.bool_)
     why = [""] * len(v)
     for i in np.flatnonzero(~in_view).tolist() if reasons else ():
@@ -186,13 +188,15 @@ def _out_of_view(sensor: Any, v: Array) -> str:
 
 
 # ---------------------------------------------------------------------- expectations
-def linearised(map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, y: Array) -> Linearised:
+def linearize_blocks(
+    map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, y: Array
+) -> Linearised:
     """Return expectations of blocks of one kind, linearised as a correction would be."""
     m, here, second, at = map_.marginal(robot, channel.second(robot), slots)
     index, _, mean = observed_block(m.x, m.blocks, m.atoms, here, second, at, model.d)
     head = channel.head(map_, robot)
     l = np.ascontiguousarray(mean[len(head) :].reshape(len(slots), model.d))
-    e, E_h, E_l, R = at_pose(channel, model, head, l, y)
+    e, E_h, E_l, R = expect_at_pose(channel, model, head, l, y)
     seen = E_h if second >= 0 else np.ascontiguousarray(E_h[:, :, : channel.pose_dof])
     Z = innovation(m.P, index, seen, E_l, R, np.zeros((len(e), R.shape[1])))[0]
     return Linearised(e, Z, E_h, E_l)
@@ -202,7 +206,7 @@ def linearised_known(
     map_: Map, channel: Channel, robot: int, model: ObservationModel, l: Array, y: Array
 ) -> Linearised:  # fmt: skip
     """Return expectations of landmarks l (K, n) of one kind that are known exactly."""
-    e, E_h, E_l, R = at_pose(channel, model, channel.head(map_, robot), l, y)
+    e, E_h, E_l, R = expect_at_pose(channel, model, channel.head(map_, robot), l, y)
     dof, second = channel.pose_dof, channel.second(robot)
     P, seen = map_.covariance([robot])[:dof, :dof], E_h[:, :, :dof]
     if second >= 0:
@@ -212,7 +216,7 @@ def linearised_known(
     return Linearised(e, seen @ P @ seen.swapaxes(1, 2) + R, E_h, E_l)
 
 
-def at_pose(
+def expect_at_pose(
     channel: Channel, model: ObservationModel, head: Array, l: Array, y: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Return e (K, m), E_h (K, p, h), E_l (K, p, n) and the noise R (K, p, p) of landmarks l (K, n).
@@ -230,6 +234,6 @@ def at_pose(
     if channel.noise_at is None:
         R = channel.sensor.noise(e)
     else:
-        T = composed(*channel.split(observer)[:2])[0]
+        T = sensor_pose(*channel.split(observer)[:2])[0]
         R = channel.noise_at(model.landmark.seen_from(T, l)[0])
     return e, E_h, E_l, np.array(np.broadcast_to(R, (len(l), z.shape[1], z.shape[1])))

@@ -24,7 +24,7 @@ from kalmark.filter.map import Map
 from kalmark.filter.observed_block import observed_block
 from kalmark.geometry.spaces import NO_TURN, Table, retract
 from kalmark.models.observe import linearize
-from kalmark.tracks.channel import Channel, ObservationModel, in_frame
+from kalmark.tracks.channel import Channel, ObservationModel, landmarks_in_frame
 from kalmark.tracks.track import Tracks
 
 PIXEL = 2  # numbers of a measurement that are searched for: the first ones, the place in the image
@@ -113,7 +113,7 @@ class Prospect:
         exactly = names[0] in tracks.known
         slots = np.zeros(len(names), np.int64) if exactly else tracks.slots_of(names)
         l = tracks.known.means(names) if exactly else map_.means(slots, model.d)
-        seen = np.flatnonzero(self.sensor.sees(in_frame(model.landmark, self.T, l)))
+        seen = np.flatnonzero(self.sensor.sees(landmarks_in_frame(model.landmark, self.T, l)))
         self.names += [names[i] for i in seen.tolist()]
         return slots[seen], l[seen] if exactly else None
 

@@ -33,7 +33,7 @@ def turn_holds(P: Array) -> bool:
     return bool(P.diagonal()[2 if len(P) == 3 else 3 :].max() <= TURN_RAD**2)
 
 
-def axes(P: Array) -> Array:
+def sigma_point_steps(P: Array) -> Array:
     """Return the steps (3, 3) to the sigma points of a pose, by rows, P (3, 3) = sum of their squares.
 
     That of the heading, with the position as it is correlated, comes first, then those of the position.
@@ -47,7 +47,7 @@ def axes(P: Array) -> Array:
     return steps
 
 
-def turned(r: Array, step: Array) -> Array:
+def turn_pose(r: Array, step: Array) -> Array:
     """Return a pose r (3,) moved by a step (3,), along the arc that an unknown turn is."""
     if step[2] == 0.0:
         return SE2.plus(r, step)
@@ -61,14 +61,14 @@ def bends(view: Any, head: Array, P: Array, y: Array, R: Array) -> Flags:
     They are of landmarks known exactly, whose numbers come behind the measurement; `head` (h,) begins with the pose of
     the covariance P (3, 3), and R (K, p, p) is the noise.
     """
-    none, steps = np.zeros((len(y), 0)), axes(P)
+    none, steps = np.zeros((len(y), 0)), sigma_point_steps(P)
     e, _, E_h, _ = linearize(view, head, none, y)  # innovations are wrapped: they count from what is expected
     white = np.linalg.inv(np.linalg.cholesky(R))
     linear = np.einsum("kpq,kqi,ai->akp", white, E_h[:, :, :3], steps)
     off = np.empty((2, *linear.shape))
     for a, step in enumerate(steps):
         for i, sign in enumerate((1.0, -1.0)):
-            there = np.concatenate([turned(head[:3], sign * step), head[3:]])
+            there = np.concatenate([turn_pose(head[:3], sign * step), head[3:]])
             change = -linearize(view, there, none, e)[1]
             off[i, a] = np.einsum("kpq,kq->kp", white, change) - sign * linear[a]
     off[~np.isfinite(off)] = np.inf

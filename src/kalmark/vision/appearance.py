@@ -51,18 +51,18 @@ class Looks(NamedTuple):
     rates: Array
 
 
-def corners(y: Array, q: float) -> Array:
+def patch_corners(y: Array, q: float) -> Array:
     """Return the corners of a patch about the pixel y (2,), clockwise from above left, and its centre: (5, 2)."""
     return y + q * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [0.0, 0.0]])
 
 
-def taken(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int, frame: int = 0) -> View | None:
+def take_view(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int, frame: int = 0) -> View | None:
     """Return the view of what is at the pixel y (2,) of an image taken from T, None too near to its border."""
     height, width = image.shape
     if not (q <= y[0] <= width - 1 - q and q <= y[1] <= height - 1 - q):
         return None
     patch = cv2.getRectSubPix(image, (2 * q + 1, 2 * q + 1), (float(y[0]), float(y[1])))
-    rays = sensor.rays(corners(y, q))
+    rays = sensor.rays(patch_corners(y, q))
     return View(patch, T.copy(), rays, frame) if np.isfinite(rays).all() else None
 
 
@@ -85,7 +85,7 @@ def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[V
     return best, likeness
 
 
-def predicted(
+def predict_templates(
     cv2: Any, views: list[list[View]], planes: list[Plane | None], places: Array, T: Array, sensor: Any, h: int
 ) -> Looks:  # fmt: skip
     """Return how landmarks at `places` (K, 3) must look from T: templates of half width h."""

@@ -57,7 +57,7 @@ class Beginning:
     over: bool = False
 
     def add(self, scan: Scan, removed: list[Id], fitted: dict[Id, Array], T: Array) -> None:
-        """Add a frame: what was `fitted` of its scan, pixels (2,) by id, the sensor being at T (7,)."""
+        """Add a frame: what was `fit_poses` of its scan, pixels (2,) by id, the sensor being at T (7,)."""
         self.scans.append((scan, removed))
         self.poses.append(T.copy())
         self.matched.append(fitted)
@@ -96,24 +96,26 @@ class Beginning:
         w = np.array([log(multiply(conjugate(first[3:]), self.poses[j][3:])) for j in some])
         t = np.array([back @ (self.poses[j][:3] - first[:3]) for j in some])
         starts = [(w, t, np.full(len(rays), prior))]
-        of_last = essential(cv2, sensor, rays, y[-1], prior)
+        of_last = solve_essential_matrix(cv2, sensor, rays, y[-1], prior)
         if of_last is not None:
             share = np.array(some)[:, None] / some[-1]
             starts.append((of_last[0] * share, of_last[1] * share, of_last[2]))
-        best = min((fitted(sensor, rays, y, *start, prior) for start in starts), key=lambda fit: fit.cost)
+        best = min((fit_poses(sensor, rays, y, *start, prior) for start in starts), key=lambda fit: fit.cost)
         middle = float(np.median(best.rho))
         parallax = float(np.median(np.abs(best.rho))) * float(np.linalg.norm(best.t[-1]))
         if parallax < PARALLAX_RAD or middle <= 0.0:
             return None
         reversed_rho = np.maximum(2.0 * middle - best.rho, LEAST_RHO * middle)
-        other = fitted(sensor, rays, y, best.w, -best.t, reversed_rho, prior)
+        other = fit_poses(sensor, rays, y, best.w, -best.t, reversed_rho, prior)
         if other.cost < best.cost:
             best, other = other, best
         same = float(np.corrcoef(best.rho, other.rho)[0, 1]) > 0.99
         return best if same or other.cost - best.cost > SURE * best.variance else None
 
 
-def essential(cv2: Any, sensor: Any, rays: Array, y: Array, prior: float) -> tuple[Array, Array, Array] | None:
+def solve_essential_matrix(
+    cv2: Any, sensor: Any, rays: Array, y: Array, prior: float
+) -> tuple[Array, Array, Array] | None:
     """Return w (3,), t (3,), rho (N,) by the essential matrix of unit rays (N, 3) and pixels y (N, 2), or None."""
     seen = np.isfinite(y[:, 0])
     now = sensor.invert(y[seen])[0]
@@ -136,7 +138,7 @@ def essential(cv2: Any, sensor: Any, rays: Array, y: Array, prior: float) -> tup
     return log(from_matrix(np.ascontiguousarray(Q.T))), t * middle / prior, rho * prior / middle
 
 
-def fitted(sensor: Any, rays: Array, y: Array, w: Array, t: Array, rho: Array, prior: float) -> Fit:
+def fit_poses(sensor: Any, rays: Array, y: Array, w: Array, t: Array, rho: Array, prior: float) -> Fit:
     """Fit poses w, t (F, 3) and rho (N,) to pixels y (F, N, 2), NaN where there is none, of unit rays (N, 3).
 
     Residuals of more than a pixel count less (Huber 1964); rho is kept about the prior +- the same.

@@ -26,14 +26,14 @@ from kalmark.report import Report
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.joint_expectation import PIXEL, Prospect, places_of
 from kalmark.tracks.track import Tracks
-from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predicted, taken
+from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predict_templates, take_view
 from kalmark.vision.beginning import Beginning, Begun
 from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
 from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
-from kalmark.vision.planes import Plane, measured, shown
-from kalmark.vision.recognition import matched_again, recognised
+from kalmark.vision.planes import Plane, plane_from_depths, plane_from_match
+from kalmark.vision.recognition import match_expected, recognize_place
 from kalmark.vision.searches import TRIAL, Searches
 from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed_corners import FirstLook
@@ -130,7 +130,7 @@ class FrontEnd:
         places = places_of(map_, tracks, channel, known)
         here = np.flatnonzero(np.isfinite(places).all(axis=1))
         views = [self.looks[known[k]].views for k in here.tolist()]
-        found = recognised(self.cv2, image, views, places[here], channel.calibrated(map_))
+        found = recognize_place(self.cv2, image, views, places[here], channel.calibrated(map_))
         return None if found is None else (found.T, found.cov)
 
     def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any = None) -> Sighting:
@@ -144,7 +144,9 @@ class FrontEnd:
         self.image, self.prospect = image, prospect
         views = [self._views(name) for name in prospect.names]
         planes = [self.looks[name].plane if name in self.looks else None for name in prospect.names]
-        looks = self.likely = predicted(cv2, views, planes, prospect.places, prospect.T, prospect.sensor, TEMPLATE)
+        looks = self.likely = predict_templates(
+            cv2, views, planes, prospect.places, prospect.T, prospect.sensor, TEMPLATE
+        )
         self.beside = beside if isinstance(self.sensor, PixelDepth) else None
         t1 = perf_counter()
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
@@ -197,7 +199,9 @@ class FrontEnd:
             look.fits((o.d2 or 0.0) / report.y.shape[1], self.frame)
             cosine, scale = self.likely.likeness[k]  # 0 where there is no view yet
             if look.plane is not None and cosine:
-                shown(self.image, self.likely.templates[k], y, look.plane.slopes, self.likely.rates[k], look.plane)
+                plane_from_match(
+                    self.image, self.likely.templates[k], y, look.plane.slopes, self.likely.rates[k], look.plane
+                )
             other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
             if other and len(look.views) < MOST_VIEWS:
                 view = self._taken(y, T)
@@ -253,13 +257,13 @@ class FrontEnd:
 
     # ------------------------------------------------------------------ landmarks
     def _taken(self, y: Array, T: Array) -> View | None:
-        return taken(self.cv2, self.image, y, T, self.sensor, PATCH, self.frame - 1)
+        return take_view(self.cv2, self.image, y, T, self.sensor, PATCH, self.frame - 1)
 
     def _plane(self, y: Array, view: View) -> Plane:
         """Return the plane about the pixel y (2,) of a first view."""
         plane = Plane(matrix(view.T[3:]) @ view.rays[4])
         if self.beside is not None:
-            measured(self.beside, y, self.sensor, view.T, TEMPLATE, plane)
+            plane_from_depths(self.beside, y, self.sensor, view.T, TEMPLATE, plane)
         return plane
 
     def _views(self, name: Id) -> list[View]:
@@ -288,7 +292,7 @@ class FrontEnd:
         if len(old) < ENOUGH or found.matched[old].sum() > len(old) / 2:
             return None
         views = [self._views(prospect.names[k]) for k in old.tolist()]
-        return matched_again(self.cv2, image, views, old, prospect, searcher)
+        return match_expected(self.cv2, image, views, old, prospect, searcher)
 
     def _first_look(self, image: Any, prospect: Prospect, found: Selection) -> None:
         """Enter where landmarks known beforehand are that have no view yet; not in each frame, as it takes long."""

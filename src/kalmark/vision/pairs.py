@@ -49,7 +49,7 @@ def with_pairs(
     middle[k:], sigma[k:] = most / 2, most / 2 / np.sqrt(GATE)
     right, found = np.full((len(y), 2), np.nan), np.zeros(len(y), np.bool_)
     if images[1] is not None and len(y):
-        right, found = matched(cv2, (images[0], images[1]), y, middle, sigma, sensor.sigma_vr_px, k, half, accept)
+        right, found = match_pair(cv2, (images[0], images[1]), y, middle, sigma, sensor.sigma_vr_px, k, half, accept)
     out = np.column_stack([y, np.where(found[:, None], right, y)])
     R = np.array(sensor.noise(out), dtype=np.float64)
     off = np.flatnonzero(~found)
@@ -65,7 +65,7 @@ def with_pairs(
     return out, R
 
 
-def matched(
+def match_pair(
     cv2: Any, images: tuple[Any, Any], y: Array, middle: Array, sigma: Array, sigma_v: float, k: int, half: int,
     accept: float,
 ) -> tuple[Array, Flags]:  # fmt: skip

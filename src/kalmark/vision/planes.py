@@ -56,7 +56,7 @@ class Plane:
         self.slopes, self.information = np.asarray(found * (STEEPEST / max(steep, STEEPEST)), dtype=np.float64), whole
 
 
-def measured(depth: Array, y: Array, sensor: Any, T: Array, half: int, plane: Plane) -> None:
+def plane_from_depths(depth: Array, y: Array, sensor: Any, T: Array, half: int, plane: Plane) -> None:
     """Fuse what the depth image (H, W) shows of the plane about the pixel y (2,), from T; nothing at an edge."""
     u, v = np.rint(y).astype(np.int64).tolist()
     window = depth[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1].ravel()
@@ -77,7 +77,7 @@ def measured(depth: Array, y: Array, sensor: Any, T: Array, half: int, plane: Pl
         plane.add(B.T @ turn @ N / along, np.linalg.inv(C))
 
 
-def shown(image: Any, template: Any, y: Array, slopes: Array, rates: Array, plane: Plane) -> None:
+def plane_from_match(image: Any, template: Any, y: Array, slopes: Array, rates: Array, plane: Plane) -> None:
     """Fuse what a match at y (2,) shows of the plane: a template (s, s) that holds with `slopes`, x_s = `rates`.
 
     rates (2, 2, 2): of x by each slope, as a matrix that multiplies x.

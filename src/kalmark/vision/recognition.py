@@ -39,14 +39,14 @@ class Recognised(NamedTuple):
     which: Index
 
 
-def matched_again(
+def match_expected(
     cv2: Any, image: Any, views: Sequence[Sequence[View]], old: Index, prospect: Prospect, searcher: Searcher
 ) -> tuple[Index, Array] | None:
     """Return landmarks (n,) of a prospect and the pixels (n, 2) where an image shows them; None if that is not sure.
 
     `old` (k,) are the landmarks of these views.
     """
-    found = recognised(cv2, image, views, prospect.places[old], prospect.sensor)
+    found = recognize_place(cv2, image, views, prospect.places[old], prospect.sensor)
     if found is None:
         return None
     rows = old[found.which]
@@ -56,11 +56,13 @@ def matched_again(
     return (rows[good], y[good]) if good.sum() >= LEAST else None
 
 
-def recognised(cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any) -> Recognised | None:
+def recognize_place(
+    cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any
+) -> Recognised | None:
     """Return where an image (H, W) of landmarks at `places` (K, 3) was taken from; None if that is not sure."""
     orb = cv2.ORB_create(CORNERS, nlevels=1, edgeThreshold=REACH + 1, patchSize=2 * REACH + 1)
-    known, owner = of_patches(cv2, orb, views)
-    seen, y = of_corners(cv2, orb, image)
+    known, owner = describe_views(cv2, orb, views)
+    seen, y = describe_corners(cv2, orb, image)
     landmark, corner = pairs(known, owner, seen)
     rays = sensor.rays(y[corner]) if len(corner) else np.zeros((0, 3))
     ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.1)
@@ -85,7 +87,7 @@ def recognised(cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Ar
     return Recognised(np.concatenate([at, from_matrix(np.ascontiguousarray(R))]), cov, landmark[agree])
 
 
-def of_patches(cv2: Any, orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any, Index]:
+def describe_views(cv2: Any, orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any, Index]:
     """Return the bits (N, 256) that describe all views, and the number (N,) of the landmark of each."""
     owner = np.array([k for k, own in enumerate(views) for _ in own], dtype=np.int64)
     patches = [view.patch for own in views for view in own]
@@ -100,24 +102,24 @@ def of_patches(cv2: Any, orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any
         )
     number = np.arange(len(patches))
     middle = side // 2 + side * np.column_stack([number % across, number // across])
-    bits, which = described(cv2, orb, whole, middle.astype(np.float64))
+    bits, which = describe_pixels(cv2, orb, whole, middle.astype(np.float64))
     return bits, owner[which]
 
 
-def of_corners(cv2: Any, orb: Any, image: Any) -> tuple[Any, Array]:
+def describe_corners(cv2: Any, orb: Any, image: Any) -> tuple[Any, Array]:
     """Return the bits (M, 256) that describe the corners of an image, and their pixels (M, 2)."""
     bits, pixels = [np.zeros((0, 256), np.float32)], [np.zeros((0, 2))]
     for size in SIZES:
         small = image if size == 1.0 else cv2.resize(image, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
         corners = cv2.goodFeaturesToTrack(small, CORNERS, QUALITY, APART_PX)
         y = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
-        some, which = described(cv2, orb, small, y)
+        some, which = describe_pixels(cv2, orb, small, y)
         bits.append(some)
         pixels.append((y[which] + 0.5) / size - 0.5)
     return np.concatenate(bits), np.concatenate(pixels)
 
 
-def described(cv2: Any, orb: Any, image: Any, y: Array) -> tuple[Any, Index]:
+def describe_pixels(cv2: Any, orb: Any, image: Any, y: Array) -> tuple[Any, Index]:
     """Return the bits (M, 256) that describe what is about the pixels y (N, 2), and which of them they are of (M,).
 
     It is turned as the grey values lie: from the pixel towards their centre of mass.

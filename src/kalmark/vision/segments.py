@@ -117,9 +117,9 @@ class LineFrontEnd:
         known = [self.looks.get(name) for name in expected.names]
         mine = np.array([np.zeros(across.shape[1]) if look is None or look.profile is None else look.profile
                          for look in known]).reshape(len(known), across.shape[1])  # fmt: skip
-        may, length = compatible(expected.e, expected.Z, segments, self.sensor.sigma_px)
+        may, length = compatible_segments(expected.e, expected.Z, segments, self.sensor.sigma_px)
         alike = mine @ across.T
-        of = paired(np.where(may & (alike >= self.settings.accept), alike * length, 0.0))
+        of = assign_pairs(np.where(may & (alike >= self.settings.accept), alike * length, 0.0))
         self.found = Matches(segments, across, of)
         removed = []
         for name, look, number in zip(expected.names, known, of.tolist(), strict=True):
@@ -177,7 +177,7 @@ class LineFrontEnd:
         for k in np.argsort(-length, kind="stable").tolist() if wanted > 0 else ():
             if length[k] < self.settings.min_length_px or len(new) == wanted:
                 break
-            if not beside(segments[k], taken).any():
+            if not near_segments(segments[k], taken).any():
                 new.append(k)
                 taken = np.concatenate([taken, segments[k : k + 1]])
         return new
@@ -224,7 +224,7 @@ def profiles(cv2: Any, image: Any, segments: Array) -> Array:
     return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
 
 
-def compatible(e: Array, Z: Array, segments: Array, sigma_px: float) -> tuple[Flags, Array]:
+def compatible_segments(e: Array, Z: Array, segments: Array, sigma_px: float) -> tuple[Flags, Array]:
     """Return which segments (M, 4) can be of lines expected at e (K, 4), and the length along these, px: (K, M) both.
 
     Z (K, 2, 2) is the covariance of the distances of the expected ends from the line that is measured, with the noise
@@ -248,7 +248,7 @@ def compatible(e: Array, Z: Array, segments: Array, sigma_px: float) -> tuple[Fl
     return may, np.maximum(common, 0.0) * length[:, None]
 
 
-def beside(segment: Array, others: Array) -> Flags:
+def near_segments(segment: Array, others: Array) -> Flags:
     """Return which of other segments (K, 4) a segment (4,) lies near: within APART_PX of their lines, along them."""
     along = others[:, 2:] - others[:, :2]
     length = np.maximum(np.hypot(*along.T), 1e-9)
@@ -259,7 +259,7 @@ def beside(segment: Array, others: Array) -> Flags:
     return near
 
 
-def paired(worth: Array) -> Index:
+def assign_pairs(worth: Array) -> Index:
     """Return of each row of what pairs are worth (K, M) its column, -1: none; the best first, each once, above 0."""
     of, worth = np.full(len(worth), -1), worth.copy()
     while worth.size and worth.max() > 0.0:

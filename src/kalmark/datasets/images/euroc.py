@@ -14,17 +14,17 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.datasets.images.rigs import MOTION, ROBOT, camera, camera_log
+from kalmark.datasets.images.rigs import MOTION, ROBOT, camera_log, camera_section
 from kalmark.errors import LogError
-from kalmark.events import Control, Frame, shown
-from kalmark.files import unpacked
+from kalmark.events import Control, Frame, short_text
+from kalmark.files import unpack_file
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.image_files import frames_of
 from kalmark.logs.log import Log, Times, Trajectory, interpolate
-from kalmark.logs.source import Format, Request, nearest, number, read_text
+from kalmark.logs.source import Format, Request, number_of_text, read_text, spelling_hint
 from kalmark.logs.table_columns import INERTIAL, TWIST3
-from kalmark.models.motion import shaken
+from kalmark.models.motion import noise_densities
 
 TRUE_STATES = "state_groundtruth_estimate0/data.csv"
 ADIS16448 = {  # the data sheet in EuRoC's imu0/sensor.yaml
@@ -61,14 +61,16 @@ def read(
     there = sorted(folder.name for folder in path.glob("cam*") if (folder / "data.csv").is_file())
     for name in cameras:
         if name not in there:
-            raise LogError(f"{path}: no camera {shown(name)}, expected {', '.join(there)}{nearest(str(name), there)}")
+            raise LogError(
+                f"{path}: no camera {short_text(name)}, expected {', '.join(there)}{spelling_hint(str(name), there)}"
+            )
     frames: list[Frame] = []
     sections: dict[str, Any] = {}
     for name in cameras:
         listed = image_list(path / name)
         taken = frames_of(ROBOT, name, [*listed], [*listed.values()], request)
         calibration = read_calibration(path / name / "sensor.yaml")
-        frames, sections[name] = [*frames, *taken], camera(taken, calibration)
+        frames, sections[name] = [*frames, *taken], camera_section(taken, calibration)
     begin, end = (pick(frame.t_ns for frame in frames) for pick in (min, max))
     states = true_states(path)
     truth = {} if states is None else {ROBOT: Trajectory(states.t_ns, states.rows[:, :7])}
@@ -76,7 +78,7 @@ def read(
     name = (path.resolve().parent if path.name == "mav0" else path).name
     if readings is None:
         return camera_log("euroc", path, request, frames, sections, MOTION, name=name, truth=truth)
-    start = None if states is None else started(states, begin)
+    start = None if states is None else start_section(states, begin)
     half_ns = int(np.median(np.diff(readings.t_ns))) // 2 if len(readings.t_ns) > 1 else 0
     since = readings.t_ns - half_ns  # a reading is of the interval around its time
     first = int(np.searchsorted(since, begin, "right")) - 1 if start is not None else 0
@@ -86,8 +88,8 @@ def read(
     times, u = since[kept], readings.rows[kept]
     held = np.maximum(times, begin) if start is not None else times  # the first one, from the start on
     controls = [Control(t_ns=t, robot=ROBOT, u=one) for t, one in zip(held.tolist(), u, strict=True)]
-    motion: dict[str, Any] = {"type": "inertial"} | data_sheet(path / "imu0" / "sensor.yaml")
-    for key, density in zip(DENSITIES, shaken(np.asarray(times * 1e-9), u), strict=True):
+    motion: dict[str, Any] = {"type": "inertial"} | inertial_noise(path / "imu0" / "sensor.yaml")
+    for key, density in zip(DENSITIES, noise_densities(np.asarray(times * 1e-9), u), strict=True):
         motion[key] = max(motion[key], density)
     return camera_log("euroc", path, request, [*frames, *controls], sections, motion, INERTIAL, name=name, truth=truth,
                       start=AT_REST if start is None else start)  # fmt: skip
@@ -104,7 +106,7 @@ def lines_of(file: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield (line, cells) of a CSV file, packed or not, without its comments.  Raises LogError."""
     packed = file.with_name(f"{file.name}.gz")
     try:
-        text = b"".join(unpacked(packed, LogError)).decode() if packed.is_file() else read_text(file)
+        text = b"".join(unpack_file(packed, LogError)).decode() if packed.is_file() else read_text(file)
     except UnicodeDecodeError as error:
         raise LogError(f"{packed}: {error}, expected UTF-8") from None
     for line, content in enumerate(text.splitlines(), 1):
@@ -123,13 +125,13 @@ def csv_of(file: Path, columns: int) -> Table | None:
     numbers: list[list[float]] = []
     for line, cells in lines_of(file):
         try:
-            t, row = int(cells[0]), [number(cell) for cell in cells[1:]]
+            t, row = int(cells[0]), [number_of_text(cell) for cell in cells[1:]]
             good = len(cells) == columns and not (t_ns and t <= t_ns[-1])
         except ValueError:
             good = False
         if not good:
             wanted = f"{columns} cells: increasing times in ns, and finite numbers"
-            raise LogError(f"{file}:{line}: {shown(','.join(cells))}, expected {wanted}")
+            raise LogError(f"{file}:{line}: {short_text(','.join(cells))}, expected {wanted}")
         t_ns.append(t)
         numbers.append(row)
     if not t_ns:
@@ -143,7 +145,7 @@ def image_list(folder: Path) -> dict[int, Path]:
     for line, cells in lines_of(folder / "data.csv"):
         if len(cells) != 2 or not cells[0].isdecimal() or (found and int(cells[0]) <= max(found)):
             where = f"{folder / 'data.csv'}:{line}"
-            raise LogError(f"{where}: {shown(','.join(cells))}, expected increasing times in ns, each with a file")
+            raise LogError(f"{where}: {short_text(','.join(cells))}, expected increasing times in ns, each with a file")
         found[int(cells[0])] = folder / "data" / cells[1]
     if not found:
         raise LogError(f"{folder / 'data.csv'}:1: no rows of data, expected times and files")
@@ -169,7 +171,7 @@ def true_states(path: Path) -> Table | None:
     return Table(table.t_ns, states)
 
 
-def started(states: Table, t_ns: int) -> dict[str, Any] | None:
+def start_section(states: Table, t_ns: int) -> dict[str, Any] | None:
     """Return the true state at a time (ns) as the section of a start, None if that is outside the true states."""
     after = int(np.searchsorted(states.t_ns, t_ns))
     if t_ns < states.t_ns[0] or after == len(states.t_ns):
@@ -183,13 +185,13 @@ def started(states: Table, t_ns: int) -> dict[str, Any] | None:
     return describe_pose(pose) | dict(zip((*TWIST3[:3], *BIASES), map(float, rest), strict=True)) | SURE
 
 
-def data_sheet(file: Path) -> dict[str, float]:
+def inertial_noise(file: Path) -> dict[str, float]:
     """Return the noise of the inertial unit: of its sensor.yaml, without one that of EuRoC's.  Raises LogError."""
-    from kalmark.logs.source import mapping
+    from kalmark.logs.source import read_mapping
 
     if not file.is_file():
         return dict(ADIS16448)
-    content = mapping(file)
+    content = read_mapping(file)
     try:
         return {own: float(content[name]) for name, own in NAMES.items()}
     except (KeyError, TypeError, ValueError) as error:

@@ -15,14 +15,14 @@ from typing import Annotated
 
 import numpy as np
 
-from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera, camera_log, no_times
+from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera_log, camera_section, no_times
 from kalmark.declare import Within
 from kalmark.errors import LogError
-from kalmark.events import Frame, shown
+from kalmark.events import Frame, short_text
 from kalmark.logs.image_files import ENDINGS, Forward, frames_of, video_facts, video_images
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows, read_path
-from kalmark.logs.source import Format, Request, frame, nanoseconds, number, rows
+from kalmark.logs.source import Format, Request, frame, nanoseconds_of_text, number_of_text, text_rows
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ogv")
 TIMES = "times.txt"
@@ -87,7 +87,9 @@ def _log(format: str, path: Path, request: Request, frames: list[Frame], t_ns: l
     file = next((place / name for place in places for name in TRUE_POSES if (place / name).is_file()), None)
     truth = {} if file is None else {ROBOT: true_path(file, t_ns, request)}
     known = known or (NEW_TSUKUBA if file is not None and file.name == TRUE_POSES[2] else {})
-    return camera_log(format, path, request, frames, {CAMERA: camera(frames, known)}, name=path.stem, truth=truth)
+    return camera_log(
+        format, path, request, frames, {CAMERA: camera_section(frames, known)}, name=path.stem, truth=truth
+    )
 
 
 def times_of(path: Path, files: list[Path], fps: float | None) -> list[int]:
@@ -100,7 +102,7 @@ def times_of(path: Path, files: list[Path], fps: float | None) -> list[int]:
     found = [named_time(file.stem) for file in files]
     t_ns = [t for t in found if t is not None]
     if len(t_ns) < len(files):
-        raise no_times(path, f"the name {shown(files[found.index(None)].name)} is no time")
+        raise no_times(path, f"the name {short_text(files[found.index(None)].name)} is no time")
     bad = next((k for k in range(1, len(t_ns)) if t_ns[k] <= t_ns[k - 1]), None)
     if bad is not None:
         raise no_times(path, f"{files[bad].name} is not after {files[bad - 1].name}")
@@ -112,18 +114,18 @@ def named_time(stem: str) -> int | None:
     if not _NUMBER.fullmatch(stem):
         return None
     if "." in stem:
-        return nanoseconds(stem)
+        return nanoseconds_of_text(stem)
     return int(stem) * UNITS_NS[len(stem)] if len(stem) in UNITS_NS else None
 
 
 def read_times(file: Path, count: int) -> list[int]:
     """Return the times (ns) of so many images: the first number of each row, in s.  Raises LogError."""
     t_ns: list[int] = []
-    for line, cells in rows(file):
+    for line, cells in text_rows(file):
         try:
-            t_ns.append(nanoseconds(cells[0]))
+            t_ns.append(nanoseconds_of_text(cells[0]))
         except ValueError:
-            raise LogError(f"{file}:{line}: {shown(cells[0])}, expected a time in s") from None
+            raise LogError(f"{file}:{line}: {short_text(cells[0])}, expected a time in s") from None
         if len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
             raise LogError(
                 f"{file}:{line}: the time {cells[0]} s is not after the one before, expected increasing times"
@@ -143,9 +145,9 @@ def true_path(file: Path, t_ns: list[int], request: Request) -> Trajectory:
     if file.name == TRUE_POSES[1]:
         return Trajectory.of(dict(kitti_rows(file, request, np.array(t_ns))))
     poses = []
-    for line, cells in rows(file):
+    for line, cells in text_rows(file):
         try:
-            numbers = np.array([number(cell) for cell in cells]).reshape(4, 3)
+            numbers = np.array([number_of_text(cell) for cell in cells]).reshape(4, 3)
         except ValueError:
             raise LogError(f"{file}:{line}: {len(cells)} cells, expected 12 finite numbers") from None
         poses.append(frame(0.01 * numbers[0], OPTICAL @ numbers[1:] @ OPTICAL))

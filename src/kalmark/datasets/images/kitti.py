@@ -12,13 +12,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from kalmark.datasets.images.folder import TIMES, images_in, read_times
-from kalmark.datasets.images.rigs import CAMERA, ROBOT, camera, camera_log
+from kalmark.datasets.images.rigs import CAMERA, ROBOT, camera_log, camera_section
 from kalmark.errors import LogError
 from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.image_files import frames_of
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows
-from kalmark.logs.source import Format, Request, number, rows
+from kalmark.logs.source import Format, Request, number_of_text, text_rows
 
 FOLDERS = "image_0", "image_2"  # of the left grey and the left colour camera
 CALIBRATION = "calib.txt"
@@ -46,7 +46,7 @@ def read(
     file = next((file for file in (own, shared) if file.is_file()), None)
     found = {} if file is None else dict(kitti_rows(file, request, np.array(t_ns)))
     truth = {ROBOT: Trajectory.of(found)} if found else {}
-    section = camera(frames, projection(path / CALIBRATION, f"P{folder.name[-1]}:")[0])
+    section = camera_section(frames, projection(path / CALIBRATION, f"P{folder.name[-1]}:")[0])
     if pair:
         section |= {"type": "stereo", "baseline_m": baseline(path / CALIBRATION, folder.name[-1], other.name[-1])}
     return camera_log("kitti_odometry", path, request, frames, {CAMERA: section}, name=path.name, truth=truth)
@@ -65,11 +65,11 @@ def projection(file: Path, name: str) -> tuple[dict[str, Any], float]:
 
     Raises LogError.
     """
-    for line, cells in rows(file):
+    for line, cells in text_rows(file):
         if cells[0] != name:
             continue
         try:
-            P = np.array([number(cell) for cell in cells[1:]]).reshape(3, 4)
+            P = np.array([number_of_text(cell) for cell in cells[1:]]).reshape(3, 4)
         except ValueError:
             raise LogError(f"{file}:{line}: {len(cells) - 1} cells, expected 12 finite numbers") from None
         found = dict(zip(INTRINSICS, (float(v) for v in (P[0, 0], P[1, 1], P[0, 2], P[1, 2])), strict=True))

@@ -9,7 +9,7 @@ from typing import Any
 from kalmark.errors import LogError
 from kalmark.events import Event, Frame
 from kalmark.logs.camera_calibration import read_calibration
-from kalmark.logs.image_files import size_of
+from kalmark.logs.image_files import image_size
 from kalmark.logs.log import Log
 from kalmark.logs.source import Request, one_robot
 
@@ -25,12 +25,12 @@ SEARCH = {
 CALIBRATIONS = ("calibration.yaml", "camera.yaml", "camera_info.yaml", "calibration.yml", "camera.yml", "config.yml")
 
 
-def camera(frames: Sequence[Frame], known: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def camera_section(frames: Sequence[Frame], known: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the section of a pin-hole camera: what is known of it, for images of the size of these.
 
     A calibration for images of another size is scaled: the centre of the first pixel is 0.
     """
-    size, found = size_of(frames), dict(known or {})
+    size, found = image_size(frames), dict(known or {})
     for axis, name in (("x", "width_px"), ("y", "height_px")):
         scale = size[name] / found.get(name, size[name])
         if scale != 1.0:

@@ -12,14 +12,14 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera, camera_log
+from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera_log, camera_section
 from kalmark.declare import Within
 from kalmark.errors import LogError
-from kalmark.events import shown
+from kalmark.events import short_text
 from kalmark.logs.image_files import DEPTH_SCALE, frames_of
 from kalmark.logs.log import Log
 from kalmark.logs.poses import read_path
-from kalmark.logs.source import Format, Request, nanoseconds, rows
+from kalmark.logs.source import Format, Request, nanoseconds_of_text, text_rows
 
 NEAR_NS = 20_000_000
 SIZE = {"width_px": 640, "height_px": 480}
@@ -47,17 +47,17 @@ def read(
     listed = read_list(path / "rgb.txt")
     depths: dict[int, Path] = {}
     if depth == "auto" and (path / "depth.txt").is_file():
-        depths = nearest([*listed], read_list(path / "depth.txt"))
+        depths = match_times([*listed], read_list(path / "depth.txt"))
     frames = frames_of(ROBOT, CAMERA, [*listed], [*listed.values()], request, [*map(depths.get, listed)], depth_scale)
     poses = path / "groundtruth.txt"
     truth = {ROBOT: read_path(poses, request)} if poses.is_file() else {}
-    section = camera(frames, calibration_beside(path) or published(path.resolve().name))
+    section = camera_section(frames, calibration_beside(path) or published_calibration(path.resolve().name))
     if depths:
         section["type"] = "pixel_depth"
     return camera_log("tum_rgbd", path, request, frames, {CAMERA: section}, name=path.name, truth=truth)
 
 
-def published(name: str) -> dict[str, Any]:
+def published_calibration(name: str) -> dict[str, Any]:
     """Return the published calibration of a sequence by its name, {} if that does not say which camera took it."""
     series = _SERIES.search(name)
     if series is None:
@@ -72,11 +72,11 @@ def read_list(file: Path) -> dict[int, Path]:
     """Return files by their times (ns), which increase, of rows `t_s file`.  Raises LogError."""
     found: dict[int, Path] = {}
     last = None
-    for line, cells in rows(file):
+    for line, cells in text_rows(file):
         try:
-            t_ns = nanoseconds(cells[0])
+            t_ns = nanoseconds_of_text(cells[0])
         except ValueError:
-            raise LogError(f"{file}:{line}: {shown(cells[0])}, expected a time in s") from None
+            raise LogError(f"{file}:{line}: {short_text(cells[0])}, expected a time in s") from None
         if len(cells) != 2 or (last is not None and t_ns <= last):
             what = "a time that is not after the one before" if len(cells) == 2 else f"{len(cells)} cells"
             raise LogError(f"{file}:{line}: {what}, expected increasing times, each with a file")
@@ -86,7 +86,7 @@ def read_list(file: Path) -> dict[int, Path]:
     return found
 
 
-def nearest(t_ns: list[int], others: dict[int, Path]) -> dict[int, Path]:
+def match_times(t_ns: list[int], others: dict[int, Path]) -> dict[int, Path]:
     """Return by time (ns) the other file nearest in time; each belongs to one time, within `NEAR_NS`."""
     times, own = np.array([*others]), np.array(t_ns)
     found: dict[int, Path] = {}

@@ -24,15 +24,15 @@ from kalmark.filter import kernels
 from kalmark.filter.compressed import immediate
 from kalmark.filter.compressed.drift import Drift
 from kalmark.filter.compressed.full_update import FullUpdate, Interval, Workspace
-from kalmark.filter.compressed.immediate import Displacements, ImmediateCorrections, Points, carried
+from kalmark.filter.compressed.immediate import Displacements, ImmediateCorrections, Points, transport_mean
 from kalmark.filter.compressed.inactive_search import InactiveSearch
-from kalmark.filter.compressed.joint_reads import carried_along, joined, split
+from kalmark.filter.compressed.joint_reads import carried_along, joint_marginal, split_active
 from kalmark.filter.compressed.schedule import PREFAULT, SLICE, Schedule
 from kalmark.filter.compressed.storage import PANEL, Triangle
-from kalmark.filter.layout import P_AT, P_SIZE, X_AT, X_SIZE, Layout, State, laid_out
+from kalmark.filter.layout import P_AT, P_SIZE, X_AT, X_SIZE, Layout, State, concatenate_tables
 from kalmark.filter.map import AT_ONCE, NO_SLOTS, Marginal, Pairs, StochasticMap
 from kalmark.filter.nearest_blocks import Sorts, distances, near_places
-from kalmark.filter.nearest_of_each import Asked, Nearest, Seen, nearest
+from kalmark.filter.nearest_of_each import Asked, Nearest, Seen, nearest_landmarks
 from kalmark.geometry.spaces import RHO, Rn, Space, Table
 
 NO_ROWS, NO_NUMBERS = np.zeros(0, dtype=np.int64), np.zeros(0)
@@ -131,7 +131,7 @@ class CompressedMap(Layout):
             slots, found, moved = slots[inactive], list[Array](), self._displacements()
             for i in range(0, len(slots), AT_ONCE):
                 blocks, atoms, numbers, rows = self._laid_out(slots[i : i + AT_ONCE])
-                x = carried(atoms, self.x[numbers], self._read(rows, self.A0), *moved)[0]
+                x = transport_mean(atoms, self.x[numbers], self._read(rows, self.A0), *moved)[0]
                 found.append(x[blocks[:, :1] + np.arange(d)])
             out[inactive] = np.concatenate(found)
         return out
@@ -144,13 +144,16 @@ class CompressedMap(Layout):
     def marginal(self, robot: int, mount: int, slots: Index) -> Marginal:
         """Return a dense map of these blocks, the active one if all are there.  A query does not activate a block."""
         m = self.active
-        own, inactive, here = split(self._at, np.concatenate([[robot, mount], slots]))
+        own, inactive, here = split_active(self._at, np.concatenate([[robot, mount], slots]))
         if not len(inactive):
             return Marginal(m, int(self._at[robot]), self.entered.get(mount, -1), self._at[slots])
         active = m.x, m.P, m.blocks[own], m.atoms, self._extra_rows()
         tables: tuple[Any, ...] = (*active, *self._kept(inactive), *self._displacements())
         return Marginal(
-            StochasticMap.of(*joined(*tables), self.axes, self.inverse_depths), int(here[0]), int(here[1]), here[2:]
+            StochasticMap.of(*joint_marginal(*tables), self.axes, self.inverse_depths),
+            int(here[0]),
+            int(here[1]),
+            here[2:],
         )
 
     def pairs(self, sorts: Sorts, robot: int, mount: int, p: Array, nearest: int, farther: float) -> Pairs:
@@ -171,7 +174,7 @@ class CompressedMap(Layout):
         if robot not in self.entered or (mount >= 0 and mount not in self.entered):
             return None
         m, own = self.active, (self.entered[robot], self.entered.get(mount, -1), d, y, R)
-        clear, found = nearest(model, m.whole, own, self._slot_of[: len(m.blocks)], asked)
+        clear, found = nearest_landmarks(model, m.whole, own, self._slot_of[: len(m.blocks)], asked)
         if not clear:
             return None
         sorts, p, *_ = asked
@@ -218,7 +221,7 @@ class CompressedMap(Layout):
         """Return the tables of inactive blocks, laid out one after the other, their numbers and rows, to be read."""
         if self._job is not None:
             self._job.know(slots)
-        return laid_out(self.blocks[slots], self.atoms)
+        return concatenate_tables(self.blocks[slots], self.atoms)
 
     def _read(self, rows: Index, columns: Index) -> Array:
         return self.storage.get(rows, columns) if self._job is None else self._job.read(rows, columns)
@@ -367,7 +370,7 @@ class CompressedMap(Layout):
             some = len(self.entered) < self.used
             if some and (self._far(robot, s) or self._points.parted(m, self.entered[robot], self._before)):
                 self.correct_all(robot, now - before)
-            if len(self._immediate.rows) >= immediate.most(self.n):
+            if len(self._immediate.rows) >= immediate.most_clone_rows(self.n):
                 self._advance(SLICE)
                 if self._job is None:
                     self.full_update()
@@ -454,7 +457,7 @@ class CompressedMap(Layout):
         S, U = (D.copy() for D in self._by_robot())
         S[:, robots.index(robot)] -= displaced[:count]
         U[:, robots.index(robot)] -= displaced[count:]
-        turns = immediate.turns_of(robot, moved, self._axes)
+        turns = immediate.world_turns(robot, moved, self._axes)
         self._immediate.add(robots.index(robot), S, U, displaced[:count], displaced[count:], *turns, self._origins())
         k = self._immediate.clone(self.active, {r: self._turn_rows(r) for r in robots})
         self._displaced_x = np.concatenate([self._s_x, self._immediate.numbers])

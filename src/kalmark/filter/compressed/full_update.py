@@ -14,9 +14,9 @@ import numpy as np
 from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import compiled
 from kalmark.filter.compressed import ranks
-from kalmark.filter.compressed.immediate import Displacements, carried
+from kalmark.filter.compressed.immediate import Displacements, transport_mean
 from kalmark.filter.compressed.storage import PANEL, Stored, Triangle, subtract
-from kalmark.filter.layout import P_AT, P_SIZE, Layout, laid_out
+from kalmark.filter.layout import P_AT, P_SIZE, Layout, concatenate_tables
 from kalmark.filter.prefault import Prefault
 
 ROWS = 8  # of the active blocks, to write at once
@@ -28,7 +28,7 @@ MORE = 1.5  # times the memory that a full update has needed: the next one may
 
 
 @compiled
-def fill(panel: Stored, begin: int, end: int, A: Index, where: Index, V: Array, P_AA: Array) -> None:
+def fill_rows(panel: Stored, begin: int, end: int, A: Index, where: Index, V: Array, P_AA: Array) -> None:
     """Write the covariances of the active blocks into the rows begin..end of the matrix, all of one panel."""
     first = begin // PANEL * PANEL
     for i in range(begin, end):
@@ -58,19 +58,19 @@ def keep(R: Array, V: Array, rows: Index, w: Array, a: Array, W: Array, P_AB: Ar
 
 
 @compiled
-def signed(R: Array, q: int) -> Array:
+def signed_factor(R: Array, q: int) -> Array:
     """Return the left factor L of rows R = [w, a, W], W (N, q): L R' = W W' - w a' - a w'."""
     m = (R.shape[1] - q) // 2
     return np.hstack((-R[:, m : 2 * m], -R[:, :m], R[:, 2 * m :]))
 
 
 @compiled
-def corrected(
+def update_elements(
     C: Array, rows: Index, columns: Index, done: tuple[int, int], where: Index, R: Array, V: Array, P_AA: Array, q: int
 ) -> None:  # fmt: skip
     """Bring elements [rows][:, columns] that were read before their panel was done up to date."""
     panel, column = done
-    to_come = signed(R[rows], q) @ R[columns].T  # of active rows anything
+    to_come = signed_factor(R[rows], q) @ R[columns].T  # of active rows anything
     for a in range(len(rows)):
         for b in range(len(columns)):
             i, j = max(rows[a], columns[b]), min(rows[a], columns[b])
@@ -176,7 +176,7 @@ class FullUpdate:
         panel = self.storage.panels[self.panel]
         if self.column == last or not self.inactive[first:last].any():
             begin, self.row = self.row, min(self.row + ROWS, last)
-            fill(panel, begin, self.row, self.interval.A, self.where, self.V, self.interval.P_AA)
+            fill_rows(panel, begin, self.row, self.interval.A, self.where, self.V, self.interval.P_AA)
             if self.row == last:
                 self._next_panel()
             return WRITING * last * int((self.where[begin : self.row] >= 0).sum())
@@ -189,7 +189,7 @@ class FullUpdate:
         end = max(begun + 1, int(np.searchsorted(self.costs, before + work, side="right")))
         start, self.column = self.column, min(last, end * PANEL)
         if self.R.shape[1]:
-            L = signed(self.R[first:last], self.q)
+            L = signed_factor(self.R[first:last], self.q)
             subtract(panel[: last - first], L, self.R, start, self.column, self.turns + self.widths)
         return int(self.costs[end - 1]) - before
 
@@ -208,7 +208,7 @@ class FullUpdate:
         C = self.storage.get(rows, columns)
         if not self.done:
             done = self.panel, self.column
-            corrected(C, rows, columns, done, self.where, self.R, self.V, self.interval.P_AA, self.q)
+            update_elements(C, rows, columns, done, self.where, self.R, self.V, self.interval.P_AA, self.q)
         return C
 
     def know(self, slots: Index) -> None:
@@ -232,9 +232,9 @@ class FullUpdate:
         if not self.rotated:
             self._rotate()
         p = self.interval
-        _, atoms, numbers, rows = laid_out(self.map.blocks[slots], self.map.atoms)
+        _, atoms, numbers, rows = concatenate_tables(self.map.blocks[slots], self.map.atoms)
         G = self.storage.get(rows, p.A0)
-        x, _, a = carried(atoms, self.x_before[numbers], G, *p.displacements)
+        x, _, a = transport_mean(atoms, self.x_before[numbers], G, *p.displacements)
         W, w = G @ self.L, G @ p.Phi_T.T + a @ (0.5 * p.P_TT)
         keep(self.R, self.V, rows, w, a, W, p.Phi @ G.T + p.P_TA.T @ a.T)
         ranks.add_rests(self.rests, rows // PANEL, W, self.storage.diagonal(rows))
@@ -250,7 +250,7 @@ class FullUpdate:
         variances = self.storage.diagonal(rows)
         rows, variances = rows[variances > 0.0], variances[variances > 0.0]
         W = self.storage.get(rows, self.interval.A0) @ self.L / np.sqrt(variances)[:, None]
-        self.L = ranks.rotated(self.L, W)
+        self.L = ranks.rotate_factor(self.L, W)
 
 
 def _in_use(map_: Layout, n: int) -> Flags:

@@ -36,7 +36,7 @@ MOST = 40  # rows of clones in a compression interval,
 MORE = 500  # and one more for so many rows of the map: a full update costs their square
 
 
-def most(n: int) -> int:
+def most_clone_rows(n: int) -> int:
     """Return how many rows of clones an interval of a map of n rows may have."""
     return MOST + n // MORE
 
@@ -82,7 +82,7 @@ def _parts(P: Array, robot: Index, points: Index, x_before: Array, x: Array, d: 
     return False
 
 
-def turns_of(robot: int, moved: dict[int, tuple[Array, Array]], axes: int) -> tuple[Array, Array]:
+def world_turns(robot: int, moved: dict[int, tuple[Array, Array]], axes: int) -> tuple[Array, Array]:
     """Return how a robot's correction turns the world, and what it did to the robots' turns (R axes,).
 
     `moved` has the robots' means before and after it.
@@ -185,7 +185,7 @@ def _since(before: Array, now: Array, done: Array) -> Array:
 
 
 @compiled
-def turning(atoms: Table, x: Array, n: int, axes: int, origin: Array) -> Array:
+def generator_in_plane(atoms: Table, x: Array, n: int, axes: int, origin: Array) -> Array:
     """Return the `generator` (n, axes) of blocks, of none or one axis, in the plane, without what is of space."""
     if axes > 1:
         return generator(atoms, x, n, axes, origin)
@@ -193,7 +193,7 @@ def turning(atoms: Table, x: Array, n: int, axes: int, origin: Array) -> Array:
 
 
 @compiled
-def move(atoms: Table, x: Array, d: Array, turn: Array, axes: int) -> None:
+def retract_in_plane(atoms: Table, x: Array, d: Array, turn: Array, axes: int) -> None:
     """`retract` blocks, of one axis, in the plane, without what is of space."""
     if axes == 1:
         retract_plane(atoms, x, d, turn)
@@ -202,7 +202,7 @@ def move(atoms: Table, x: Array, d: Array, turn: Array, axes: int) -> None:
 
 
 @compiled
-def carried(
+def transport_mean(
     atoms: Table, x: Array, G: Array, S: Array, U: Array, robots: Index, turn: Array, turns: Array, origins: Array,
     axes: int,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
@@ -216,7 +216,7 @@ def carried(
     a = np.zeros((n, len(U) + axes * (D.shape[1] - robots[:, 0].sum() - len(robots))))
     column = kept = turned_by = stood = 0
     x, x_left, d = x.copy(), x, np.empty(n)
-    turned = turning(atoms, x, n, axes, origins[0])
+    turned = generator_in_plane(atoms, x, n, axes, origins[0])
     for k in range(len(robots) + 1):
         immediate = k < len(robots)
         count = robots[k, 0] if immediate else D.shape[1] - column
@@ -234,9 +234,9 @@ def carried(
                         d[i] += a[i, kept + j] * turns[turned_by + j]
             own = kept + robot * axes
             if axes == 6:
-                turned = turning(atoms, x, n, axes, origins[stood + robot])
-            move(atoms, x, d, by, axes)
-            now = turning(atoms, x, n, axes, origins[stood + robot])
+                turned = generator_in_plane(atoms, x, n, axes, origins[stood + robot])
+            retract_in_plane(atoms, x, d, by, axes)
+            now = generator_in_plane(atoms, x, n, axes, origins[stood + robot])
             for i in range(n):
                 for j in range(axes):
                     a[i, own + j] += now[i, j] - turned[i, j]

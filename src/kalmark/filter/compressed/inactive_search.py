@@ -14,7 +14,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter.layout import Layout
-from kalmark.filter.nearest_blocks import Sorts, distance, has_place, least
+from kalmark.filter.nearest_blocks import Sorts, distance, has_place, kth_least
 from kalmark.filter.nearest_of_each import Nearest
 
 Joint = Callable[[Index], Array]
@@ -57,7 +57,7 @@ def near_in_region(
                 near[count], gaps[count] = i, gap
                 count += 1
         if count >= most:
-            far = least(gaps[:count], most)
+            far = kth_least(gaps[:count], most)
         for i in range(count):
             found[near[i]] = found[near[i]] or gaps[i] <= far
         inside = inside and distance(p[k], centre) + far <= radius
@@ -65,7 +65,7 @@ def near_in_region(
 
 
 @compiled
-def none_nearer(
+def is_nearest(
     p: Array, d2: Array, sigma: Array, limit: Array, own: Index, centre: Array, radius: float, slots: Index,
     places: Array, spread: Array, at: Index, sorts: Sorts,
 ) -> tuple[int, Index]:  # fmt: skip
@@ -158,7 +158,7 @@ class InactiveSearch:
         region = self._region or self._around(p, REGION)
         while True:
             asked = p, found.d2, found.sigma, found.limit, own, *region, at, sorts
-            verdict, unknown = none_nearer(*asked)
+            verdict, unknown = is_nearest(*asked)
             if len(unknown):
                 self._reference = self._reference if self._reference >= 0 else int(own.max())
                 slots = np.append(self._reference, region.slots[unknown])

@@ -7,8 +7,8 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
-from kalmark.filter.compressed.immediate import carried
-from kalmark.filter.layout import laid_out
+from kalmark.filter.compressed.immediate import transport_mean
+from kalmark.filter.layout import concatenate_tables
 from kalmark.geometry.spaces import Table
 
 
@@ -24,12 +24,12 @@ def carried_along(
     """
     count = C.shape[1] - len(C)
     G = C[:, :count].copy()
-    x, x_left, a = carried(atoms, x, G, S, U, robots, turn, turns, origins, axes)
+    x, x_left, a = transport_mean(atoms, x, G, S, U, robots, turn, turns, origins, axes)
     return x, np.concatenate((G, a), axis=1), C[:, count:].copy(), x_left
 
 
 @compiled
-def split(at: Index, slots: Index) -> tuple[Index, Index, Index]:
+def split_active(at: Index, slots: Index) -> tuple[Index, Index, Index]:
     """Return of blocks those that are active, by their slots in the active map, and the inactive ones, each once.
 
     And the place (K,) of each where active ones come first; a slot of -1 is none.
@@ -55,7 +55,7 @@ def split(at: Index, slots: Index) -> tuple[Index, Index, Index]:
 
 
 @compiled
-def joined(
+def joint_marginal(
     x: Array, P: Array, blocks: Table, atoms: Table, extra: Index,
     blocks_B: Table, atoms_B: Table, x_B: Array, C: Array,
     S: Array, U: Array, robots: Index, turn: Array, turns: Array, origins: Array, axes: int,
@@ -65,7 +65,7 @@ def joined(
     P_BA = G P, P_BB = G P G' + Q, where G is in the rows `extra` of P.
     """
     x_B, G, Q, _ = carried_along(atoms_B, x_B, C, S, U, robots, turn, turns, origins, axes)
-    own, table, numbers, rows = laid_out(blocks, atoms)
+    own, table, numbers, rows = concatenate_tables(blocks, atoms)
     e, n, b, a = len(extra), len(rows), len(own), len(table)
     P_own = kernels.submatrix(P, np.concatenate((extra, rows)))
     B = G @ P_own[:e]

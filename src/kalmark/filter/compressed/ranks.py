@@ -19,7 +19,7 @@ ROUGH = SAMPLE // 8  # directions beyond which a row near the active blocks has 
 FEWEST = 2000  # rows of a map: in a smaller one all tiles are about as wide as W
 
 
-def rotated(L: Array, W: Array) -> Array:
+def rotate_factor(L: Array, W: Array) -> Array:
     """Return L Q (n, q) with a rotation Q that leaves rows far from the active blocks few columns.
 
     W (N, q) are rows of P0_BA L, in units of their sigmas.

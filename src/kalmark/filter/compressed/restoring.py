@@ -16,7 +16,7 @@ from kalmark.geometry.spaces import Space
 NUMBERS: dict[str, Any] = {"float64": np.float64, "float32": np.float32}
 
 
-def restored(state: State, read: Read) -> CompressedMap:
+def restore_compressed(state: State, read: Read) -> CompressedMap:
     """Build a map that was saved in mid-interval.  Raises MapError if its parts do not fit each other."""
     interval = state["postponed"]
     dtype, most, limit = NUMBERS[interval["numbers"]], interval["most"], interval["limit_bytes"]
