@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import kalmark as km
 from kalmark.campaign.running import run_campaign
 from kalmark.config import build_slam, config_dict, load_config
 from kalmark.config.opening import open_run
+from kalmark.declare import built_in, parameters
 from kalmark.errors import ConfigError, KalmarkError, ModelError
 from kalmark.logs import FORMATS, formats
 from kalmark.results.recording import config_yaml
@@ -267,3 +269,20 @@ def test_a_saved_configuration_is_the_same_configuration(tmp_path: Path) -> None
     with pytest.raises(KalmarkError, match="no_such"):
         load_config(path, ["log.no_such=1"])
     assert config_dict(load_config(path)) == config_dict(config)
+
+
+def test_help_of_a_declared_class_is_readable() -> None:
+    for role in ("motion", "sensor", "landmark", "association", "estimator", "detector", "initialization"):
+        for model in built_in(role):
+            signature = str(inspect.signature(model))
+            assert "Annotated" not in signature + str(inspect.signature(model.__init__))
+            assert ": '" not in signature
+            told = inspect.getdoc(model)
+            assert all(f"\n    {each.on_a_line}" in told for each in parameters(model) if each.text)
+
+    class Wider(km.sensors.RangeBearing):
+        pass
+
+    assert inspect.signature(Wider) == inspect.signature(km.sensors.RangeBearing)
+    line = "sigma_bearing_rad = 0.02 [rad]: Noise of the bearing.  Expected: a positive number."
+    assert line in km.sensors.RangeBearing.__doc__ and "`type: range_bearing`" in km.sensors.RangeBearing(0.2).__doc__

@@ -15,7 +15,11 @@ MODULES = (
     "association", "detect", "estimators", "geometry", "initialization", "landmarks", "motion", "presets", "sensors",
     "vision",
 )  # fmt: skip
-PACKAGES = ("kalmark.campaign", "kalmark.config", "kalmark.logs", "kalmark.simulate")
+PACKAGES = (
+    "kalmark.campaign", "kalmark.config", "kalmark.declare", "kalmark.errors", "kalmark.events", "kalmark.logs",
+    "kalmark.models.protocols", "kalmark.report", "kalmark.results.history", "kalmark.simulate",
+    "kalmark.geometry.directions", "kalmark.geometry.frames3d", "kalmark.geometry.rotations",
+)  # fmt: skip
 
 
 def test_a_console_offers_the_names_of_kalmark_and_no_others() -> None:
@@ -31,7 +35,7 @@ def test_a_public_module_lists_its_names(module: ModuleType) -> None:
     for name in names:
         assert not name.startswith("_")
         home = getattr(getattr(module, name), "__module__", "kalmark")
-        assert home.startswith(("kalmark", "builtins")), f"{name} is of {home}"
+        assert home.startswith(("kalmark", "builtins", "types")), f"{name} is of {home}"
     defined = [n for n, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__]
     assert {name for name in defined if not name.startswith("_")} <= {*names}
 

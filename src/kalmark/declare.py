@@ -31,6 +31,11 @@ from kalmark.events import bound, largest_magnitude, short_text
 from kalmark.geometry.spaces import Space
 from kalmark.plugins import load_all
 
+__all__ = [
+    "Count", "Estimated", "Limit", "NotNegative", "Number", "Parameter", "Positive", "Probability", "Values", "Within",
+    "declared", "parameters", "register",
+]  # fmt: skip
+
 Class = TypeVar("Class", bound=type)
 
 UNITS = {
@@ -137,6 +142,12 @@ class Parameter:
         kinds = [{bool: "True or False", str: "a text"}.get(self.type, number), *self.words]
         return " or ".join(filter(None, [", ".join(kinds[:-1]), kinds[-1]]))
 
+    @property
+    def on_a_line(self) -> str:
+        """The parameter on a line: name, default, unit, meaning and bounds."""
+        default = "" if self.default is None else f" = {self.default!r}"
+        return f"{self.name}{default}{self.unit and f' [{self.unit}]'}: {self.text}  Expected: {self.wanted}."
+
     def refused(self, value: Any) -> str:
         """Return what a value is to be instead, nothing if it is that."""
         if (value is None and self.optional) or (isinstance(value, str) and value in self.words):
@@ -198,9 +209,9 @@ def options_of(function: Callable[..., Any], after: int) -> tuple[Parameter, ...
     return tuple(_parameter(each.name, each.default, hints.get(each.name, Any)) for each in named)
 
 
-def _hints(of: Any) -> dict[str, Any]:
+def _hints(of: Any, include_extras: bool = True) -> dict[str, Any]:
     try:
-        return get_type_hints(of, include_extras=True)
+        return get_type_hints(of, include_extras=include_extras)
     except (NameError, TypeError):  # of a user: types that only a checker knows, or an object that is called
         return {}
 
@@ -243,9 +254,31 @@ def summary(model: type) -> str:
     return " ".join((inspect.getdoc(model) or "").partition("\n\n")[0].split())
 
 
+class _Readable:
+    """The signature of a declared class, its types without bounds and texts.  It is made when it is read."""
+
+    def __get__(self, instance: Any, model: Any) -> inspect.Signature:
+        types = _hints(model, include_extras=False)
+        _, *named = inspect.signature(model.__init__).parameters.values()
+        return inspect.Signature([each.replace(annotation=types.get(each.name, each.empty)) for each in named])
+
+
+@dataclass(frozen=True)
+class _Documented:
+    """The docstring of a declared class with its parameters.  It is made when it is read."""
+
+    text: str
+
+    def __get__(self, instance: Any, model: type) -> str:
+        rows = [each.on_a_line for each in parameters(model) if each.text]
+        name = registered_name(model)
+        named = f"  In a configuration: `type: {name}`." if name else ""
+        return "\n    ".join([f"{inspect.cleandoc(self.text)}\n\nParameters.{named}\n", *rows]) if rows else self.text
+
+
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def declared(model: Class) -> Class:
-    """Make a class a frozen dataclass whose parameters are checked when one is made."""
+    """Make a class a frozen dataclass whose parameters are checked when one is made, and shown by `help`."""
     if "__dataclass_params__" in vars(model):  # a user's, made one in another way
         return model
     after = next((vars(each)["__post_init__"] for each in model.__mro__ if "__post_init__" in vars(each)), None)
@@ -258,7 +291,9 @@ def declared(model: Class) -> Class:
 
         _CHECKS.add(__post_init__)
         model.__post_init__ = __post_init__  # type: ignore[attr-defined]
-    return dataclass(frozen=True)(model)  # type: ignore[return-value]
+    made: Any = dataclass(frozen=True)(model)
+    made.__init__.__annotations__, made.__signature__, made.__doc__ = {}, _Readable(), _Documented(made.__doc__)
+    return made
 
 
 # ------------------------------------------------------------------ names

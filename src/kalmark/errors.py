@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+__all__ = [
+    "ConfigError", "DataError", "DivergedError", "EventError", "ImageError", "KalmarkError", "LogError", "MapError",
+    "ModelError", "PluginError", "RunError",
+]  # fmt: skip
+
 LONGEST = 1000  # characters of a message
 
 

@@ -20,6 +20,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import EventError, ImageError, KalmarkError
 
+__all__ = ["Control", "Event", "Fix", "Frame", "Scan", "in_order", "order"]
+
 Id = int | str
 
 FLOAT = np.dtype(np.float64)

@@ -16,6 +16,11 @@ from kalmark.events import Event, Id, Scan, seconds_text
 from kalmark.filter.estimators import Correction
 from kalmark.geometry.gaussian import ellipses
 
+__all__ = [
+    "OUTCOMES", "Candidate", "Compared", "Expectations", "Gap", "JudgedScan", "LandmarkEstimate", "LandmarkTable",
+    "Observation", "Repeat", "Report",
+]  # fmt: skip
+
 Late = tuple[int, str, str, int]
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
 ALONE = "measurement alone cannot start a landmark"

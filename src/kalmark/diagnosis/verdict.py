@@ -44,6 +44,8 @@ from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 from kalmark.tracks.surveys import MISFITS
 
+__all__ = ["Cause", "Effect", "Verdict", "diagnose"]
+
 MOST = 20_000  # observations that a diagnosis takes
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, MOST_OFF = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong

@@ -13,6 +13,8 @@ from kalmark.arrays import Array
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import inv_observe, move, observe
 
+__all__ = ["TextbookSlam"]
+
 
 class TextbookSlam:
     """One robot with a range-bearing sensor at its centre and points: x = (robot, landmarks), P their covariance."""

@@ -13,6 +13,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 
+__all__ = ["direction_many", "inv_spherical_many", "spherical_many", "unit_many"]
+
 
 @compiled
 def unit_many(v: Array) -> tuple[Array, Array]:

@@ -16,6 +16,11 @@ from kalmark.compiled import compiled
 from kalmark.geometry import rotations
 from kalmark.geometry.frames import one_or_many
 
+__all__ = [
+    "compose", "from_euler_pose", "from_frame", "from_frame_many", "inverse", "minus", "move", "plus", "to_euler_pose",
+    "to_frame", "to_frame_many", "turned_rates",
+]  # fmt: skip
+
 
 @compiled
 def plus(a: Array, d: Array) -> Array:

@@ -16,6 +16,11 @@ from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.angles import wrap
 
+__all__ = [
+    "conjugate", "exp", "from_euler", "from_matrix", "left_jacobian", "left_jacobian_inverse", "left_jacobian_rate",
+    "log", "matrix", "multiply", "normalised", "skew", "to_euler",
+]  # fmt: skip
+
 
 @compiled
 def skew(v: Array) -> Array:

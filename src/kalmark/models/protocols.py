@@ -19,6 +19,14 @@ from kalmark.arrays import Array, Flags
 from kalmark.errors import ModelError
 from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
 
+__all__ = [
+    "Ambiguous", "Calibrated", "Checked", "Completing", "Distant", "Drifting", "FarCorrected", "FullSensor",
+    "HasPlace", "HasVelocity", "HoldsRate", "Intersecting", "Joining", "Landmark", "Motion", "NonAdditiveSensor",
+    "NonlinearCalibration", "OfState", "OwnNoise", "Parametrized", "Pointed", "Ranging", "Reparametrizable",
+    "SeesVelocity", "SegmentVisible", "Segmented", "SelfCalibrating", "Sensor", "StartNoise", "StateDiffusion",
+    "TimedNoise", "UnknownDepth", "Visible",
+]  # fmt: skip
+
 
 @runtime_checkable
 class Motion(Protocol):

@@ -19,6 +19,11 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id, list_names
 from kalmark.report import Gap
 
+__all__ = [
+    "Biased", "CalibratedMount", "Camera", "Controlled", "History", "LandmarkChange", "MapSnapshot", "Measuring",
+    "Prior", "RelocatedRobot", "Repeated", "RobotStart", "UsedFix",
+]  # fmt: skip
+
 Ints = Index
 Texts = npt.NDArray[np.str_]
 Arrays = dict[str, npt.NDArray[Any]]

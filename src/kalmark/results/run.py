@@ -13,6 +13,8 @@ from kalmark.results.history import Camera, Measuring
 from kalmark.results.recording import Recording, file_name
 from kalmark.results.scene import steps_of
 
+__all__ = ["Run"]
+
 FILES = (
     *("summary.json", "config.yaml", "landmarks.csv", "associations.csv", "changes.csv", "history.npz", "map.kmk"),
     *("map.png", "report.html", "trajectory_*.tum", "sensor_*.png"),
