@@ -20,7 +20,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import EventError, ImageError, KalmarkError
 
-__all__ = ["Control", "Event", "Fix", "Frame", "Scan", "in_order", "order"]
+__all__ = ["Control", "Event", "Fix", "Frame", "Scan", "sort_events", "sort_key"]
 
 Id = int | str
 

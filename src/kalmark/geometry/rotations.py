@@ -18,7 +18,7 @@ from kalmark.geometry.angles import wrap
 
 __all__ = [
     "conjugate", "exp", "from_euler", "from_matrix", "left_jacobian", "left_jacobian_inverse", "left_jacobian_rate",
-    "log", "matrix", "multiply", "normalised", "skew", "to_euler",
+    "log", "matrix", "multiply", "normalize", "skew", "to_euler",
 ]  # fmt: skip
 
 
