@@ -136,7 +136,7 @@ def test_the_only_old_landmark_in_a_gate_is_weighed_against_a_new_one_where_othe
 def test_a_ring_road_without_ids_closes_and_no_pair_is_wrong(seed: int) -> None:
     world = load_world("ring_road", ["ids=true"])
     log = hide_ids(simulate(world, seed))
-    summary = km.record(build_slam(world.config(), log), log, progress=False).evaluate()
+    summary = km.record(build_slam(world.config(), log), log, progress=False, pictures=False).evaluate()
     assert summary["wrong"] == summary["duplicates"] == 0
     assert 53 <= summary["landmarks"] <= 56
     assert summary["landmark_rmse_m"] < 0.7

@@ -37,7 +37,7 @@ def garden(tmp_path: Path) -> km.Log:
 def run_of(log: km.Log) -> Run:
     lidar = km.Mount(km.sensors.RangeBearing(0.02, 0.01))
     cart = km.Robot("cart", km.motion.Odometry2D(), sensors={"lidar": lidar})
-    return km.record(km.Slam([cart], km.association.GlobalAssignment()), log, progress=False)
+    return km.record(km.Slam([cart], km.association.GlobalAssignment()), log, progress=False, pictures=False)
 
 
 def test_the_filter_is_not_told_and_the_summary_says_how_often_it_was_wrong(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_two_landmarks_where_the_log_has_one_are_told(tmp_path: Path) -> None:
     cart = km.Robot("cart", km.motion.Odometry2D(), sensors={"lidar": km.Mount(km.sensors.RangeBearing(0.02, 0.01))})
     slam = km.Slam([cart], km.association.GlobalAssignment())
     half, jump = log.events[:6], km.Control(5.5, "cart", (0.0, 2.0, 0.0))  # the robot is carried off
-    run = km.record(slam, replace(log, events=[*half, jump, *log.events[6:]]), progress=False)
+    run = km.record(slam, replace(log, events=[*half, jump, *log.events[6:]]), progress=False, pictures=False)
     assert run.evaluate()["duplicates"] == 3
 
 

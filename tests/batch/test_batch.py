@@ -48,7 +48,7 @@ def robot(name: str, motion: object, **more: object) -> km.Robot:
 
 
 def filtered(robots: list[km.Robot], events: list[Event], **more: object) -> Run:
-    return record(km.Slam(robots, **more), events, progress=False)
+    return record(km.Slam(robots, **more), events, progress=False, pictures=False)
 
 
 def assert_equal(batch: Batch, dense: tuple[Array, Array, Array, float], nodes: list[int]) -> None:
@@ -217,7 +217,7 @@ def test_the_gradient_of_a_robust_factor_is_the_derivative_of_its_sum() -> None:
 
 def test_the_start_of_the_search_does_not_matter_even_turned_by_half_a_radian() -> None:
     log = circle()
-    run = record(slam_for(log), log, progress=False)
+    run = record(slam_for(log), log, progress=False, pictures=False)
     batch = solve_batch(run, log)
     turn = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
     poses = batch.state.groups[POSES]
@@ -233,7 +233,7 @@ def test_the_invariant_filter_ends_with_the_optimal_map_and_sigma_and_the_textbo
     figures = {}
     for name, estimator in (("invariant", km.estimators.Invariant()), ("ekf", km.estimators.Ekf())):
         slam = build_slam(world.config(), log)
-        run = record(km.Slam(slam.robots.values(), estimator=estimator), log, progress=False)
+        run = record(km.Slam(slam.robots.values(), estimator=estimator), log, progress=False, pictures=False)
         figures[name] = batch_entry(run, log)
     assert 0.95 < figures["invariant"]["sigma_ratio"] < 1.05
     assert figures["ekf"]["sigma_ratio"] < 0.8
@@ -254,34 +254,34 @@ def test_an_observation_the_filter_rejected_does_not_count() -> None:
     without = Scan(t_ns=scan.t_ns, robot="rover", sensor="lidar", y=y[1:], ids=scan.ids[1:])
     slam = slam_for(log)
     gated = km.association.ByIdentity(gate=0.9999)
-    run = record(km.Slam(slam.robots.values(), association=gated), spoiled, progress=False)
+    run = record(km.Slam(slam.robots.values(), association=gated), spoiled, progress=False, pictures=False)
     assert run.evaluate()["rejected"] == 1
     clean = [*events[:k], without, *events[k + 1 :]]
-    other = record(km.Slam(slam.robots.values(), association=gated), clean, progress=False)
+    other = record(km.Slam(slam.robots.values(), association=gated), clean, progress=False, pictures=False)
     assert np.allclose(solve_batch(run, spoiled).means, solve_batch(other, clean).means, atol=1e-9)
 
 
 def test_landmarks_known_beforehand_are_kept_or_weighed_by_their_covariance() -> None:
     log = circle()
-    one, two = record(slam_for(log), log, progress=False).landmarks.ids[:2]
+    one, two = record(slam_for(log), log, progress=False, pictures=False).landmarks.ids[:2]
     exact, surveyed = log.landmarks[one], log.landmarks[two] + [0.1, 0.0]
     slam = slam_for(log)
     slam.add_landmark(one, exact)
-    run = record(slam, log, progress=False)
+    run = record(slam, log, progress=False, pictures=False)
     batch = solve_batch(run, log)
     at = batch.ids.index(one)
     assert np.array_equal(batch.means[at], exact) and not batch.covariances[at].any()
     slam = slam_for(log)
     slam.add_landmark(two, surveyed, np.eye(2) * 1e-6)
-    run = record(slam, log, progress=False)
+    run = record(slam, log, progress=False, pictures=False)
     batch, given = solve_batch(run, log), solve_batch(run, log, known={two: (surveyed, np.eye(2) * 1e-6)})
     assert np.array_equal(batch.means, given.means)  # the run has kept the survey
     at = batch.ids.index(two)
     assert np.linalg.norm(batch.means[at] - surveyed) < 0.01
     assert np.trace(batch.covariances[at]) < 2e-6
     half = len(log.events) // 2
-    record(slam := slam_for(log), log.events[:half], progress=False)
-    rest = record(slam, log.events[half:], progress=False)
+    record(slam := slam_for(log), log.events[:half], progress=False, pictures=False)
+    rest = record(slam, log.events[half:], progress=False, pictures=False)
     with pytest.raises(KalmarkError, match="was in the map beforehand"):  # with covariances between landmarks
         solve_batch(rest, log.events[half:])
 
@@ -304,7 +304,7 @@ def test_a_range_only_beacon_known_roughly_is_solved_too() -> None:
     slam = km.Slam([beacon])
     prior = (np.array([4.5, -2.5]), np.eye(2))
     slam.add_landmark("beacon", *prior)
-    run = record(slam, out, progress=False)
+    run = record(slam, out, progress=False, pictures=False)
     batch = solve_batch(run, out, known={"beacon": prior})
     k = batch.ids.index("beacon")
     assert np.linalg.norm(batch.means[k] - [4.0, -3.0]) < 3 * batch.sigma()[k] < 1.5
@@ -313,7 +313,7 @@ def test_a_range_only_beacon_known_roughly_is_solved_too() -> None:
 
 def test_another_log_than_that_of_the_run_is_refused() -> None:
     log = circle()
-    run = record(slam_for(log), log, progress=False)
+    run = record(slam_for(log), log, progress=False, pictures=False)
     with pytest.raises(KalmarkError, match="expected the log of the run"):
         solve_batch(run, list(log)[:-10])
     nameless = replace(run, source=None)
@@ -326,7 +326,7 @@ def test_a_saved_run_finds_its_log_again(tmp_path: Path) -> None:
     columns["sensor_columns"] = {("rover", "lidar"): ("range_m", "bearing_rad")}
     write_native(replace(circle(), **columns), tmp_path / "log")
     log = open_log(tmp_path / "log")
-    run = record(slam_for(circle()), log, progress=False)
+    run = record(slam_for(circle()), log, progress=False, pictures=False)
     run.save(tmp_path / "run")
     loaded = Run.load(tmp_path / "run")
     found, wanted = loaded.evaluate(batch=True)["batch"], compare_with_filter(run, solve_batch(run, log))
@@ -338,7 +338,7 @@ def test_a_saved_run_finds_its_log_again(tmp_path: Path) -> None:
 
 def test_a_search_cut_short_says_how_far_it_came() -> None:
     log = circle()
-    run = record(slam_for(log), log, progress=False)
+    run = record(slam_for(log), log, progress=False, pictures=False)
     with pytest.raises(KalmarkError, match=r"the last of 1 steps is .* of the map, expected 1e-09"):
         solve_batch(run, log, iterations=1)
 
@@ -348,7 +348,7 @@ def test_a_landmark_that_is_not_determined_is_refused() -> None:
     slam = km.Slam([looker])
     slam.add_landmark(1, (5.0, 0.0), np.eye(2))
     events = [Scan(0.0, "r", "eye", [[0.0]], ids=[1])]
-    run = record(slam, events, progress=False)
+    run = record(slam, events, progress=False, pictures=False)
     assert solve_batch(run, events, known={1: ((5.0, 0.0), np.eye(2))}).covariances[0][0, 0] == pytest.approx(1.0)
     with pytest.raises(KalmarkError, match="not determined"):
         solve_batch(run, events, known={1: ((5.0, 0.0), np.eye(2) * 1e20)})
@@ -356,7 +356,7 @@ def test_a_landmark_that_is_not_determined_is_refused() -> None:
 
 def test_without_truth_there_is_no_path_ratio() -> None:
     log = circle(truth=False)
-    run = record(slam_for(log), log, progress=False)
+    run = record(slam_for(log), log, progress=False, pictures=False)
     figures = compare_with_filter(run, solve_batch(run, log))
     assert figures["path_ratio"] is None
     assert figures["path_difference_m"] < 0.5
@@ -376,7 +376,7 @@ def test_on_lost_in_the_woods_within_1_m_only_the_invariant_filter_knows_what_it
     data("lost_in_the_woods/dataset2.mat")
     config = load_config("lost_in_the_woods", ["log.r_max=1.0", f"estimator.type={estimator}"])
     log = open_config_log(config)
-    run = record(build_slam(config, log), log, progress=False)
+    run = record(build_slam(config, log), log, progress=False, pictures=False)
     figures = compare_with_filter(run, solve_batch(run, log, progress=False))
     assert low < figures["sigma_ratio"] < high
     if estimator == "invariant":
@@ -387,6 +387,6 @@ def test_on_lost_in_the_woods_within_1_m_only_the_invariant_filter_knows_what_it
 def test_readings_of_the_state_and_range_rates_are_not_in_the_batch_solution(name: str, used: set[str]) -> None:
     world = load_world(name, ["steps=60"])
     log = simulate(world, seed=1)
-    run = record(build_slam(world.config(), log), log, progress=False)
+    run = record(build_slam(world.config(), log), log, progress=False, pictures=False)
     assert set(run.history.sensor.tolist()) > used
     assert set(batch_input(run).associations.sensor.tolist()) == used

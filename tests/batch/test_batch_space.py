@@ -78,7 +78,7 @@ def robot(motion: object, names: tuple[str, ...], **more: object) -> km.Robot:
 
 def filtered(who: km.Robot, events: list[Event], **more: object) -> Run:
     more = {"association": km.association.ByIdentity(), "landmarks": km.landmarks.Point3D()} | more
-    return record(km.Slam([who], **more), events, progress=False)
+    return record(km.Slam([who], **more), events, progress=False, pictures=False)
 
 
 def dense(events: list[Event], landmarks: Array) -> tuple[Array, Array, Array, float]:
@@ -207,7 +207,7 @@ def test_on_starry_night_the_invariant_filter_ends_near_the_optimum(data: Callab
     data("starry_night")
     config = load_config("starry_night", ["estimator.type=invariant"])
     log = open_config_log(config)
-    run = record(build_slam(config, log), log, progress=False)
+    run = record(build_slam(config, log), log, progress=False, pictures=False)
     figures = run.evaluate(batch=True)["batch"]
     assert figures["path_ratio"] < 1.5
     assert 0.9 < figures["sigma_ratio"] < 1.1

@@ -249,7 +249,7 @@ def test_a_filter_of_corners_ends_near_the_optimum_of_its_own_sightings(rng: np.
         for j, name in enumerate(sensors):
             mine = (seen.pose == i) & (seen.camera == j)
             events.append(km.Scan(t_s=0.1 * i, robot="rig", sensor=name, y=y[mine], ids=seen.tag[mine].tolist()))
-    run = km.record(slam, events, progress=False)
+    run = km.record(slam, events, progress=False, pictures=False)
     problem = tag_problem(run)
     batch = optimum(problem)
     figures = compare_tags(run, problem, batch)

@@ -28,7 +28,7 @@ def known() -> tuple[Run, Log]:
     """Return a run of a log that tells the ids."""
     world = load_world("random_field", WORLD)
     log = simulate(world, 3)
-    return km.record(build_slam(world.config(), log), log, progress=False), log
+    return km.record(build_slam(world.config(), log), log, progress=False, pictures=False), log
 
 
 def decided_again(run: Run, log: Log, names: Sequence[Any], free: bool = True) -> Reassociated:

@@ -24,7 +24,7 @@ WALLS = (
 def test_the_batch_solution_of_walls_is_that_of_the_filter_and_fits_the_noise() -> None:
     world = load_world("hall_of_walls", WALLS)
     log = simulate(world, 1)
-    run = km.record(build_slam(world.config(), log), log, progress=False)
+    run = km.record(build_slam(world.config(), log), log, progress=False, pictures=False)
     found = compare_with_filter(run, solve_batch(run, log))
     assert found["landmarks"] == 15
     assert 0.95 < found["sigma_ratio"] < 1.1
@@ -35,7 +35,7 @@ def test_the_batch_solution_of_walls_is_that_of_the_filter_and_fits_the_noise() 
 def test_walls_and_corners_are_solved_for_together() -> None:
     world = load_world("hall_of_walls", ("steps=120",))
     log = simulate(world, 1)
-    run = km.record(build_slam(world.config(), log), log, progress=False)
+    run = km.record(build_slam(world.config(), log), log, progress=False, pictures=False)
     problem = replay_events(batch_input(run), log)
     held = ~problem.free[problem.start.columns(1, np.arange(len(problem.ids))) + 2]
     sizes = {name: len(run.final_slam().mean(name)) for name in problem.ids}

@@ -170,7 +170,7 @@ def test_a_frame_is_what_its_image_as_a_scan_is_and_is_read_when_it_is_needed() 
     one, other, reads = km.Slam(robot), km.Slam(robot), iter([image])
     seen = one.process(km.Scan(1.0, "r", "camera", image))
     frames = [km.Frame(1.0, "r", "camera", lambda: next(reads))]
-    run = km.record(other, frames, progress=False)
+    run = km.record(other, frames, progress=False, pictures=False)
     assert [o[1:] for o in seen.observations] == [(7, "new", 7, None, "", ())]
     assert np.array_equal(one.mean(7), other.mean(7))
     assert run.history.stepped == "scan"

@@ -30,7 +30,7 @@ def run_of(keys: dict[str, float], by: dict[str, tuple[float, ...]], seed: int =
         change = change_measurements({("robot", sensor)}, lambda y, factors=factors: y * factors)
         log = replace(log, events=[change(event) for event in log])
     config = world.config()
-    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)
+    run = km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
     return run, replace(simulated, log=log)
 
 

@@ -105,7 +105,7 @@ def test_a_report_says_what_was_fused_late_and_the_run_counts_it() -> None:
     slam, (events, _) = slam_of(KEEPS), drive(30)
     late = [one for report in run(slam, events) for one in report.late]
     assert len(late) == len(set(late)) == 4 * len(slam.landmarks().ids), "all but the confirming one"
-    recorded = km.record(slam_of(KEEPS), events, progress=False)
+    recorded = km.record(slam_of(KEEPS), events, progress=False, pictures=False)
     assert recorded.history.late.sum() == len(late)
     assert set(recorded.history.outcome[recorded.history.late]) == {"tentative"}
 

@@ -182,7 +182,7 @@ def test_an_id_of_the_log_is_never_taken_for_a_name_made_up(tmp_path: Path) -> N
 def test_a_run_makes_up_no_name_that_comes_later_in_its_log() -> None:
     slam = slam_of(confirm=1)
     events = [km.Scan(t, "cart", "lidar", [[5.0, 0.1 * t]], [i]) for t, i in ((0, None), (20, "u1"), (21, "u1"))]
-    km.record(slam, events, progress=False)
+    km.record(slam, events, progress=False, pictures=False)
     assert slam.landmarks().ids == ["u2", "u1"]
 
 

@@ -45,7 +45,7 @@ def driven(sensor: Any, at: np.ndarray, weave: float) -> Run:
         events += [Control(t_ns=k * STEP_NS, robot="r", u=step + rng.normal(size=6) * sigma, cov=LEVEL)]
         events += [Scan(t_ns=k * STEP_NS, robot="r", sensor="eye", y=y, ids=seen.tolist())]
     robot = km.Robot("r", km.motion.Odometry3D(), sensors={"eye": km.Mount(sensor, at, cov=PRIOR)})
-    return record(km.Slam([robot]), events, progress=False)
+    return record(km.Slam([robot]), events, progress=False, pictures=False)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_what_was_not_observed_is_warned_of_and_stands_in_every_report(planar: R
 def test_a_camera_that_flies_about_observes_its_whole_mount() -> None:
     world = load_world("self_calibration", ["steps=80"])
     log = simulate(world, seed=1)
-    summary = record(build_slam(world.config(), log), log, progress=False).evaluate()
+    summary = record(build_slam(world.config(), log), log, progress=False, pictures=False).evaluate()
     ratios = [row["ratio"] for row in summary["mounts"]["beta.camera"]["directions"]]
     assert len(ratios) == 6
     assert max(ratios) < 0.5

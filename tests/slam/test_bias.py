@@ -199,7 +199,7 @@ def test_a_map_with_a_bias_resumes_bit_for_bit(tmp_path: Path) -> None:
 
 def test_what_was_found_is_in_the_summary_of_a_run_and_of_one_that_is_read_again(tmp_path: Path) -> None:
     events, _ = drive(60, 2, BIAS)
-    recorded = km.record(slam_of(PRIOR), events, progress=False)
+    recorded = km.record(slam_of(PRIOR), events, progress=False, pictures=False)
     told = recorded.evaluate()["biases"]["r"]
     assert told["v_mps"] == pytest.approx(recorded.slam.mean("r bias")[0])
     assert 0 < told["sigma_w_radps"] < PRIOR["sigma_w_bias_radps"]
@@ -209,7 +209,12 @@ def test_what_was_found_is_in_the_summary_of_a_run_and_of_one_that_is_read_again
 
 def test_of_wheels_the_summary_has_radii_and_track_not_by_what_they_are_off() -> None:
     simulated = simulation(load_world("differential_drive", ["steps=100"]), 1)
-    run = record(build_slam(load_world("differential_drive").config(), simulated.log), simulated.log, progress=False)
+    run = record(
+        build_slam(load_world("differential_drive").config(), simulated.log),
+        simulated.log,
+        progress=False,
+        pictures=False,
+    )
     told, stated = run.evaluate()["biases"]["rover"], {"left_radius_m": 0.1, "right_radius_m": 0.1, "track_m": 0.5}
     for (name, value), off in zip(stated.items(), simulated.constants["rover"], strict=True):
         assert abs(told[name] - (value + off)) < 4.0 * told[f"sigma_{name}"] < 0.5 * value

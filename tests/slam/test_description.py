@@ -217,7 +217,7 @@ def test_a_run_with_every_option_is_the_same_map_by_the_command_line_and_after_l
     carried = {robot.name: [*robot.sensors] for robot in robots}
     columns = {key: tuple(each.sensor.columns) for robot in robots for key, each in robot.sensors.items()}
     write_log(tmp_path / "log", carried, columns)
-    recorded = km.record(slam, km.open_log(tmp_path / "log"), progress=False)
+    recorded = km.record(slam, km.open_log(tmp_path / "log"), progress=False, pictures=False)
     assert len(slam.landmarks()) >= 3
     recorded.save(tmp_path / "run")
     monkeypatch.setattr("kalmark.compiled.say_compiling", lambda: None)
@@ -244,7 +244,7 @@ def test_options_of_a_log_and_landmarks_added_in_python_are_in_the_configuration
     slam = km.Slam([km.Robot("r", km.motion.Unicycle(), sensors={"s": km.Mount(SENSORS[0])})])
     slam.add_landmark(0, PLACES[0], random_covariance(2))
     slam.add_landmark("post", (1.0 / 3.0, 7.0))
-    km.record(slam, log, progress=False).save(tmp_path / "run")
+    km.record(slam, log, progress=False, pictures=False).save(tmp_path / "run")
     km.Run.load(tmp_path / "run").save(tmp_path / "copy")
     assert main(["run", str(tmp_path / "copy" / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
     texts = [(tmp_path / folder / "landmarks.csv").read_text() for folder in ("run", "copy", "again")]

@@ -127,7 +127,7 @@ def test_a_run_is_written_read_and_resumed(name: str, tmp_path: Path) -> None:
     robot = build_slam(world.config()).robots["rover"]
     header = (tmp_path / "log" / "controls.csv").read_text().splitlines()[0]
     assert header == ",".join(("t_s", "robot", *robot.motion.columns))
-    run = km.record(build_slam(world.config(), back), back, progress=False)
+    run = km.record(build_slam(world.config(), back), back, progress=False, pictures=False)
     assert run.evaluate()["robots"]["rover"]["ate_m"] < 0.3
     run.save(tmp_path / "run")
     again = km.Run.load(tmp_path / "run")

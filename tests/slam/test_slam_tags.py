@@ -167,7 +167,7 @@ def run() -> km.Run:
         if t:
             events.append(km.Control(t, "r", u + rng.normal(size=6) * [0.01, 0.01, 0.01, 0.005, 0.005, 0.005]))
         events.append(sight(t, pose, l[ids], rng, ids))
-    return km.record(slam, events, progress=False)
+    return km.record(slam, events, progress=False, pictures=False)
 
 
 def test_what_is_left_of_the_corners_is_the_noise_and_is_kept(run: km.Run, tmp_path: Path) -> None:

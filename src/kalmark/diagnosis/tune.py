@@ -163,7 +163,7 @@ class _Task:
     def run(self, values: Values, log: Log) -> Run:
         """Return the run with other values of some keys."""
         made = config_of(Tree(self.keys.changed(values)), None)
-        return record(build_slam(made, log), log, progress=False, config=config_dict(made))
+        return record(build_slam(made, log), log, progress=False, config=config_dict(made), pictures=False)
 
     def judged(self, values: Values) -> _Judged:
         """Return the whole log filtered with some values."""

@@ -20,16 +20,31 @@ from kalmark.errors import ModelError
 from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
 
 __all__ = [
-    "Ambiguous", "Calibrated", "Checked", "Completing", "Distant", "Drifting", "FarCorrected", "FullSensor",
-    "HasPlace", "HasVelocity", "HoldsRate", "Intersecting", "Joining", "Landmark", "Motion", "NonAdditiveSensor",
+    "Ambiguous", "Calibrated", "Capability", "Checked", "Completing", "Distant", "Drifting", "FarCorrected",
+    "FullSensor", "HasPlace", "HasVelocity", "HoldsRate", "Intersecting", "Joining", "Landmark", "Motion", "NonAdditiveSensor",
     "NonlinearCalibration", "OfState", "OwnNoise", "Parametrized", "Pointed", "Ranging", "Reparametrizable",
     "SeesVelocity", "SegmentVisible", "Segmented", "SelfCalibrating", "Sensor", "StartNoise", "StateDiffusion",
     "TimedNoise", "UnknownDepth", "Visible",
 ]  # fmt: skip
+_FOUND: dict[tuple[type, type], bool] = {}
+
+
+class _OnceAClass(type(Protocol)):  # type: ignore[misc]
+    """Type of protocols that `isinstance` compares once with each class; an instance at a time costs 20 us and more."""
+
+    def __instancecheck__(cls, model: object) -> bool:
+        key = cls, type(model)
+        if key not in _FOUND:
+            _FOUND[key] = super().__instancecheck__(model)
+        return _FOUND[key]
+
+
+class Capability(Protocol, metaclass=_OnceAClass):
+    """What all models of a class offer, or none of them."""
 
 
 @runtime_checkable
-class Motion(Protocol):
+class Motion(Capability, Protocol):
     """The motion of a robot.  [S] (1), (14)-(17)."""
 
     @property
@@ -58,7 +73,7 @@ class Motion(Protocol):
 
 
 @runtime_checkable
-class Sensor(Protocol):
+class Sensor(Capability, Protocol):
     """The measurement of a landmark at v in the frame of the sensor.  [S] (2), (18)."""
 
     @property
@@ -101,7 +116,7 @@ class NonAdditiveSensor(Sensor, Protocol):
 
 
 @runtime_checkable
-class Landmark(Protocol):
+class Landmark(Capability, Protocol):
     """The view of a landmark from a pose: v, the landmark in the frame T of the sensor."""
 
     @property
@@ -121,47 +136,47 @@ class Landmark(Protocol):
 
 # ------------------------------------------------------------------ capabilities with a default
 @runtime_checkable
-class _FindsDepth(Protocol):
+class _FindsDepth(Capability, Protocol):
     finds_depth: bool
 
 
 @runtime_checkable
-class _OfPair(Protocol):
+class _OfPair(Capability, Protocol):
     of_pair: bool
 
 
 @runtime_checkable
-class _SeesKinds(Protocol):
+class _SeesKinds(Capability, Protocol):
     sees_kinds: tuple[str, ...]
 
 
 @runtime_checkable
-class _OfWorld(Protocol):
+class _OfWorld(Capability, Protocol):
     world: str
 
 
 @runtime_checkable
-class _Image(Protocol):
+class _Image(Capability, Protocol):
     image: tuple[float, float]
 
 
 @runtime_checkable
-class _RangeLimit(Protocol):
+class _RangeLimit(Capability, Protocol):
     range_max_m: float
 
 
 @runtime_checkable
-class _FieldOfView(Protocol):
+class _FieldOfView(Capability, Protocol):
     fov_rad: float
 
 
 @runtime_checkable
-class _Coasts(Protocol):
+class _Coasts(Capability, Protocol):
     coasts: bool
 
 
 @runtime_checkable
-class SelfCalibrating(Protocol):
+class SelfCalibrating(Capability, Protocol):
     """A motion of which constants may be in the map, and estimated."""
 
     @property
@@ -185,7 +200,7 @@ class NonlinearCalibration(SelfCalibrating, Protocol):
 
 
 @runtime_checkable
-class StateDiffusion(Protocol):
+class StateDiffusion(Capability, Protocol):
     """A motion of which the diffusion depends on its state, such as a velocity in it."""
 
     def diffusion_at(self, r: Array, u: Array, dt_s: float) -> Array | None:
@@ -193,12 +208,12 @@ class StateDiffusion(Protocol):
 
 
 @runtime_checkable
-class _StateColumns(Protocol):
+class _StateColumns(Capability, Protocol):
     state_columns: tuple[str, ...]
 
 
 @runtime_checkable
-class HasVelocity(Protocol):
+class HasVelocity(Capability, Protocol):
     """A motion whose state contains the velocity of the robot."""
 
     def body_velocity(self, r: Array) -> tuple[Array, Array]:
@@ -209,7 +224,7 @@ class HasVelocity(Protocol):
 
 
 @runtime_checkable
-class HoldsRate(Protocol):
+class HoldsRate(Capability, Protocol):
     """A motion of which the state has the velocity, and the control in force the turn rate: an inertial unit."""
 
     columns: tuple[str, ...]
@@ -232,7 +247,7 @@ def velocity_in(motion: Any, r: Array, u: Array) -> tuple[Array, Array]:
 
 
 @runtime_checkable
-class _SeesRates(Protocol):
+class _SeesRates(Capability, Protocol):
     sees_rates: bool
 
 
@@ -242,12 +257,12 @@ def sees_rates(sensor: object) -> bool:
 
 
 @runtime_checkable
-class _NamesParameters(Protocol):
+class _NamesParameters(Capability, Protocol):
     parameter_names: tuple[str, ...]
 
 
 @runtime_checkable
-class _InnovationSize(Protocol):
+class _InnovationSize(Capability, Protocol):
     cov_size: int
 
 
@@ -334,7 +349,7 @@ def innovation_size(sensor: Sensor) -> int:
 
 # ------------------------------------------------------------------ capabilities of sensors
 @runtime_checkable
-class Visible(Protocol):
+class Visible(Capability, Protocol):
     """A sensor with a limited field of view."""
 
     def sees(self, v: Array) -> Flags:
@@ -342,7 +357,7 @@ class Visible(Protocol):
 
 
 @runtime_checkable
-class SegmentVisible(Protocol):
+class SegmentVisible(Capability, Protocol):
     """A sensor that measures parts of line segments."""
 
     def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
@@ -350,7 +365,7 @@ class SegmentVisible(Protocol):
 
 
 @runtime_checkable
-class Parametrized(Protocol):
+class Parametrized(Capability, Protocol):
     """A sensor with parameters of its own, which its compiled expectation takes."""
 
     @property
@@ -374,7 +389,7 @@ class Calibrated(Parametrized, Protocol):
 
 
 @runtime_checkable
-class SeesVelocity(Protocol):
+class SeesVelocity(Capability, Protocol):
     """A sensor of landmarks that stand still, whose measurements depend on its own velocity, too.
 
     Its v (K, 2 d) are points and, behind them, the velocity of the sensor, both in its frame (`velocity_view.py`).
@@ -396,7 +411,7 @@ class OfState(Sensor, Protocol):
 
 
 @runtime_checkable
-class _Keeps(Protocol):
+class _Keeps(Capability, Protocol):
     keep: int
 
 
@@ -406,7 +421,7 @@ def poses_kept(sensor: OfState) -> int:
 
 
 @runtime_checkable
-class TimedNoise(Protocol):
+class TimedNoise(Capability, Protocol):
     """A sensor of the state whose noise depends on how long a reading means."""
 
     def noise_since(self, dt_s: float) -> Array:
@@ -414,7 +429,7 @@ class TimedNoise(Protocol):
 
 
 @runtime_checkable
-class Drifting(Protocol):
+class Drifting(Capability, Protocol):
     """A sensor whose parameters walk at random."""
 
     def drift(self, dt_s: float) -> Array:
@@ -422,7 +437,7 @@ class Drifting(Protocol):
 
 
 @runtime_checkable
-class Distant(Protocol):
+class Distant(Capability, Protocol):
     """A sensor whose measurements determine the distance."""
 
     def distances(self, y: Array) -> Array:
@@ -443,7 +458,7 @@ class Ranging(Distant, Protocol):
 
 
 @runtime_checkable
-class Intersecting(Protocol):
+class Intersecting(Capability, Protocol):
     """A sensor of which two measurements, from two poses, determine a point."""
 
     def meet(self, T: Array, y: Array, y2: Array) -> Array:
@@ -451,7 +466,7 @@ class Intersecting(Protocol):
 
 
 @runtime_checkable
-class Ambiguous(Protocol):
+class Ambiguous(Capability, Protocol):
     """A sensor of which one measurement fits two poses: planar pose ambiguity, Schweighofer and Pinz 2006."""
 
     def both(self, y: Array) -> tuple[Array, Array, Array]:
@@ -459,7 +474,7 @@ class Ambiguous(Protocol):
 
 
 @runtime_checkable
-class FarCorrected(Protocol):
+class FarCorrected(Capability, Protocol):
     """A sensor whose measurements far from the expected ones are first corrected as poses."""
 
     def is_far(self, y: Array, z: Array) -> Flags:
@@ -470,7 +485,7 @@ class FarCorrected(Protocol):
 
 
 @runtime_checkable
-class OwnNoise(Protocol):
+class OwnNoise(Capability, Protocol):
     """A sensor whose innovations are something else than its measurements, so that a scan's covariance is converted."""
 
     def noise_from(self, y: Array, cov: Array) -> Array:
@@ -478,7 +493,7 @@ class OwnNoise(Protocol):
 
 
 @runtime_checkable
-class StartNoise(Protocol):
+class StartNoise(Capability, Protocol):
     """A sensor whose noise when a landmark starts is another one than in a correction."""
 
     def start_noise(self, y: Array) -> Array:
@@ -486,7 +501,7 @@ class StartNoise(Protocol):
 
 
 @runtime_checkable
-class Checked(Protocol):
+class Checked(Capability, Protocol):
     """A sensor that cannot have made every measurement of the right shape."""
 
     def check(self, y: Array) -> None:
@@ -495,14 +510,14 @@ class Checked(Protocol):
 
 # ------------------------------------------------------------------ capabilities of landmarks
 @runtime_checkable
-class UnknownDepth(Protocol):
+class UnknownDepth(Capability, Protocol):
     """A landmark that starts at a prior inverse distance where the sensor finds no depth."""
 
     prior_rho_per_m: float
 
 
 @runtime_checkable
-class Completing(Protocol):
+class Completing(Capability, Protocol):
     """A landmark that supplies what a measurement does not determine of it."""
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, Array | None]:
@@ -510,7 +525,7 @@ class Completing(Protocol):
 
 
 @runtime_checkable
-class Pointed(Protocol):
+class Pointed(Capability, Protocol):
     """A landmark that is one point."""
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
@@ -526,7 +541,7 @@ class Reparametrizable(Pointed, Protocol):
 
 
 @runtime_checkable
-class Segmented(Protocol):
+class Segmented(Capability, Protocol):
     """A line, of which a segment from abscissa to abscissa is kept."""
 
     first_ends: tuple[float, float]
@@ -553,7 +568,7 @@ class Joining(Segmented, Protocol):
 
 
 @runtime_checkable
-class HasPlace(Protocol):
+class HasPlace(Capability, Protocol):
     """A landmark that is somewhere."""
 
     def place(self, l: Array) -> tuple[Array, Array]:
