@@ -23,11 +23,14 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "project_pages",
+    "api_pages",
 ]
 exclude_patterns = ["course", "site", "**/*.ipynb"]
 root_doc = "index"
 language = "en"
-nitpicky = True
+maximum_signature_line_length = 90
+add_module_names = False
+toc_object_entries = False
 
 # Markdown as a code host shows it
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]

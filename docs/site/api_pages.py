@@ -1,0 +1,212 @@
+"""The reference of the program in api/: a page for each public module and for each name in its `__all__`.
+
+Signatures and texts are those of the docstrings; of a declared model its parameters, its columns and its name in a
+configuration follow from the declaration.
+"""
+
+import inspect
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from docstrings import rst, signature_of
+
+import kalmark as km
+from kalmark.declare import is_own, parameters, registered_name, world_of_class
+
+# shown as, module, of what
+PARTS = [
+    ("Slam and its parts", "kalmark", "kalmark"),
+    ("Motions", "km.motion", "kalmark.models.motion"),
+    ("Sensors", "km.sensors", "kalmark.models.sensors"),
+    ("Landmarks", "km.landmarks", "kalmark.models.landmarks"),
+    ("Association", "km.association", "kalmark.association"),
+    ("Estimators", "km.estimators", "kalmark.filter.estimators"),
+    ("Starts of landmarks", "km.initialization", "kalmark.management.initialization"),
+    ("Detectors", "km.detect", "kalmark.detect"),
+    ("Images", "km.vision", "kalmark.vision"),
+    ("Sensor presets", "km.presets", "kalmark.presets"),
+    ("Geometry", "km.geometry", "kalmark.geometry"),
+    ("Rotations", "km.geometry.rotations", "kalmark.geometry.rotations"),
+    ("Poses in space", "km.geometry.frames3d", "kalmark.geometry.frames3d"),
+    ("Directions", "km.geometry.directions", "kalmark.geometry.directions"),
+    ("The textbook filter", "kalmark.filter.textbook", "kalmark.filter.textbook"),
+    ("Events", "kalmark.events", "kalmark.events"),
+    ("Reports", "kalmark.report", "kalmark.report"),
+    ("History of a run", "kalmark.results.history", "kalmark.results.history"),
+    ("Verdict", "kalmark.diagnosis.verdict", "kalmark.diagnosis.verdict"),
+    ("Logs", "kalmark.logs", "kalmark.logs"),
+    ("Configurations", "kalmark.config", "kalmark.config"),
+    ("Simulation", "kalmark.simulate", "kalmark.simulate"),
+    ("Campaigns", "kalmark.campaign", "kalmark.campaign"),
+    ("Protocols of models", "kalmark.models.protocols", "kalmark.models.protocols"),
+    ("Declarations of models", "kalmark.declare", "kalmark.declare"),
+    ("Errors", "kalmark.errors", "kalmark.errors"),
+]
+HOMES = {module: shown for _, shown, module in PARTS}
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Write the pages before Sphinx reads them."""
+    app.connect("builder-inited", lambda app: write(Path(app.srcdir) / "api"))
+    return {"parallel_read_safe": True}
+
+
+def write(folder: Path) -> None:
+    """Write all pages that differ, and remove those of names that are gone."""
+    pages = {"index": _index()}
+    for _, shown, name in PARTS:
+        module = import_module(name)
+        names = {one: _page(shown, one, getattr(module, one)) for one in module.__all__}
+        names = {one: page for one, page in names.items() if not inspect.ismodule(getattr(module, one))}
+        pages[shown] = _module(shown, module, names)
+        pages |= {
+            page: _name(shown, one, getattr(module, one)) for one, page in names.items() if page.startswith(f"{shown}.")
+        }
+    folder.mkdir(exist_ok=True)
+    for old in {*folder.glob("*.rst")} - {folder / f"{page}.rst" for page in pages}:
+        old.unlink()
+    for page, text in pages.items():
+        file = folder / f"{page}.rst"
+        if not file.exists() or file.read_text() != text:
+            file.write_text(text)
+
+
+def _page(shown: str, name: str, thing: Any) -> str:
+    """Return the page of a name: that of `km` itself where it is one of those."""
+    return f"kalmark.{name}" if name in km.__all__ and getattr(km, name) is thing else f"{shown}.{name}"
+
+
+def _head(title: str) -> str:
+    return f"{title}\n{'=' * len(title)}\n"
+
+
+def _toctree(pages: list[str]) -> str:
+    return "\n".join([".. toctree::", "   :hidden:", "", *(f"   {page}" for page in pages), ""])
+
+
+def _list(rows: list[tuple[str, ...]], heads: tuple[str, ...] = ()) -> str:
+    out = [".. list-table::", *([f"   :header-rows: {1}"] if heads else []), ""]
+    for row in [heads, *rows] if heads else rows:
+        out += [f"   {'*' if k == 0 else ' '} - {cell}" for k, cell in enumerate(row)]
+    return "\n".join([*out, ""])
+
+
+def _index() -> str:
+    rows = [(f":doc:`{shown} <{shown}>`", title) for title, shown, _ in PARTS]
+    said = (
+        "Every public name: signature, shapes, units, frames, errors. ``km`` is ``kalmark``: ``import kalmark as km``."
+    )
+    return "\n".join([_head("Names"), said, "", _list(rows), _toctree([shown for _, shown, _ in PARTS])])
+
+
+def _module(shown: str, module: Any, names: dict[str, str]) -> str:
+    first = (inspect.getdoc(module) or "").split("\n\n")[0]
+    parts = [_head(shown), rst(first), ""]
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(_group(getattr(module, name)), []).append(name)
+    for group, members in groups.items():
+        if len(groups) > 1:
+            parts += [group, "-" * len(group), ""]
+        told = [(f":doc:`{n} <{names[n]}>`", rst(_summary(getattr(module, n)))) for n in members]
+        parts += [_list(told)]
+    inner = [other for _, other, _ in PARTS if other.rpartition(".")[0] == shown]
+    below = (
+        [other for _, other, _ in PARTS if other.startswith("km.") and other.count(".") == 1]
+        if shown == "kalmark"
+        else inner
+    )
+    if below:
+        parts += ["Modules", "-------", "", _list([(f":doc:`{o}`", t) for t, o, _ in PARTS if o in below])]
+    return "\n".join([*parts, _toctree([page for page in names.values() if page.startswith(f"{shown}.")])])
+
+
+def _group(thing: Any) -> str:
+    world = world_of_class(thing) if isinstance(thing, type) and registered_name(thing) else ""
+    if world:
+        return f"In the {world}" if world == "plane" else "In space"
+    if isinstance(thing, type):
+        return "Classes"
+    return "Functions" if callable(thing) else "Values"
+
+
+def _docstring(thing: Any) -> str:
+    """Return the docstring, of a declared model without its parameters; of a value nothing."""
+    if isinstance(thing, type):
+        return inspect.cleandoc(getattr(vars(thing).get("__doc__"), "text", None) or thing.__doc__ or "")
+    return inspect.getdoc(thing) or "" if callable(thing) else ""
+
+
+def _summary(thing: Any) -> str:
+    text = " ".join(_docstring(thing).partition("\n\n")[0].split())
+    return text.partition(".  ")[0].rstrip(".") + "." if text else ""
+
+
+def _name(shown: str, name: str, thing: Any) -> str:
+    parts = [
+        _head(name),
+        f".. py:currentmodule:: {shown.replace('km', 'kalmark', 1) if shown.startswith('km.') else shown}",
+        "",
+    ]
+    if isinstance(thing, type):
+        parts += _class(name, thing)
+    elif callable(thing):
+        parts += [f".. py:function:: {name}{signature_of(thing)}", "", _indented(rst(_docstring(thing)))]
+    else:
+        value = repr(thing)
+        parts += [
+            f".. py:data:: {name}",
+            "",
+            _indented(f"``{value}``" if len(value) < 200 else f"A ``{type(thing).__name__}``."),
+        ]
+    return "\n".join([*parts, ""])
+
+
+def _class(name: str, thing: type) -> list[str]:
+    told = [f".. py:class:: {name}{signature_of(thing)}", "", _indented(rst(_docstring(thing))), ""]
+    named = registered_name(thing)
+    if named and is_own(thing):
+        return told + _model(name, thing, named)
+    own = [each for each in thing.__mro__ if each.__module__.startswith("kalmark")]
+    members = {key: member for each in reversed(own) for key, member in vars(each).items() if not key.startswith("_")}
+    for key, member in members.items():
+        text = _indented(rst(inspect.getdoc(member) or ""), 2)
+        if isinstance(member, property):
+            told += [f"   .. py:property:: {key}", "", text, ""]
+        elif isinstance(member, classmethod | staticmethod) or inspect.isfunction(member):
+            kind = {classmethod: "\n      :classmethod:", staticmethod: "\n      :staticmethod:"}.get(type(member), "")
+            inner = getattr(member, "__func__", member)
+            told += [
+                f"   .. py:method:: {key}{signature_of(inner, not isinstance(member, staticmethod))}{kind}",
+                "",
+                text,
+                "",
+            ]
+    return told
+
+
+def _model(name: str, thing: Any, named: str) -> list[str]:
+    made = thing()
+    columns = ", ".join(f"``{column}``" for column in getattr(made, "columns", ()))
+    what = "Control" if hasattr(made, "move") else "Measurement"
+    where = {"plane": "in the plane", "space": "in space"}.get(world_of_class(thing), "")
+    facts = "; ".join(filter(None, [f"{what}: {columns}" if columns else "", where]))
+    declared = [each for each in parameters(thing) if each.text]
+    some = [p for p in declared if isinstance(p.default, int | float) and p.default != float("inf")][:2]
+    home = next((shown for _, shown, module in PARTS if getattr(sys.modules[module], name, None) is thing), "km")
+    keys = "".join(f", {p.name}: {str(p.default).lower() if isinstance(p.default, bool) else p.default}" for p in some)
+    told = [facts[:1].upper() + facts[1:] + "." if facts else "", "", ".. code-block:: python", ""]
+    call = f"{home.replace('kalmark', 'km', 1)}.{name}({', '.join(f'{p.name}={p.default!r}' for p in some)})"
+    told += [f"   {call}", "", "In a configuration:", "", ".. code-block:: yaml", "", f"   {{type: {named}{keys}}}", ""]
+    rows = [(f"``{p.name}``", _default(p.default), p.unit, rst(f"{p.text}  Expected: {p.wanted}.")) for p in declared]
+    return [*told, _list(rows, ("parameter", "default", "unit", "meaning"))] if rows else told
+
+
+def _default(value: Any) -> str:
+    return "" if value is None else f"``{value:.6g}``" if isinstance(value, float) else f"``{value!r}``"
+
+
+def _indented(text: str, by: int = 1) -> str:
+    return "\n".join(("   " * by + line) if line else "" for line in text.splitlines())
