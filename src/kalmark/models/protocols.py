@@ -21,10 +21,10 @@ from kalmark.geometry.spaces import RHO, VECTOR, VECTOR3, Space
 
 __all__ = [
     "Ambiguous", "Calibrated", "Capability", "Checked", "Completing", "Distant", "Drifting", "FarCorrected",
-    "FullSensor", "HasPlace", "HasVelocity", "HoldsRate", "Intersecting", "Joining", "Landmark", "Motion", "NonAdditiveSensor",
-    "NonlinearCalibration", "OfState", "OwnNoise", "Parametrized", "Pointed", "Ranging", "Reparametrizable",
-    "SeesVelocity", "SegmentVisible", "Segmented", "SelfCalibrating", "Sensor", "StartNoise", "StateDiffusion",
-    "TimedNoise", "UnknownDepth", "Visible",
+    "FullSensor", "HasPlace", "HasVelocity", "HoldsRate", "Intersecting", "Joining", "Landmark", "Motion",
+    "NonAdditiveSensor", "NonlinearCalibration", "OfState", "OwnNoise", "Parametrized", "Pointed", "Ranging",
+    "Reparametrizable", "SeesVelocity", "SegmentVisible", "Segmented", "SelfCalibrating", "Sensor", "StartNoise",
+    "StateDiffusion", "TimedNoise", "UnknownDepth", "Visible",
 ]  # fmt: skip
 _FOUND: dict[tuple[type, type], bool] = {}
 
