@@ -9,6 +9,7 @@ import math
 import sys
 import textwrap
 from contextlib import suppress
+from functools import cache
 from typing import Any
 
 from pydantic import BaseModel
@@ -123,15 +124,15 @@ def _table(model: type[BaseModel], common: type[BaseModel] = Section) -> str:
     return "\n".join(["| key | default | unit | meaning |", "|---|---|---|---|", *rows]) if rows else ""
 
 
-def _texts(model: type[BaseModel]) -> dict[str, str]:
+@cache
+def _texts(section: type) -> dict[str, str]:
     """Return the text below each key in the source of a section: pydantic would read it each time kalmark starts."""
-    texts: dict[str, str] = {}
-    for section in reversed(model.__mro__):
-        with suppress(OSError, TypeError):  # it has no source: made of a declaration
-            body = ast.parse(textwrap.dedent(inspect.getsource(section))).body[0].body  # type: ignore[attr-defined]
-            for key, text in itertools.pairwise(body):
-                if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
-                    texts[key.target.id] = inspect.cleandoc(text.value.value)  # type: ignore[attr-defined, union-attr]
+    texts = {key: text for base in reversed(section.__bases__) for key, text in _texts(base).items()}
+    with suppress(OSError, TypeError):  # it has no source: made of a declaration
+        body = ast.parse(textwrap.dedent(inspect.getsource(section))).body[0].body  # type: ignore[attr-defined]
+        for key, text in itertools.pairwise(body):
+            if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
+                texts[key.target.id] = inspect.cleandoc(text.value.value)  # type: ignore[attr-defined, union-attr]
     return texts
 
 
