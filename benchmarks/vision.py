@@ -44,7 +44,7 @@ LINES = (
     "robots.each.sensors.lines={type: segments, images: camera, detector: {type: line_search},"
     " landmark: {type: anchored_homogeneous_line, prior_rho_per_m: 0.5, sigma_rho_per_m: 0.5}}"
 )
-PARTS = ("search", "match", "start", "learn", "filter")  # templates; ...; new landmarks; patches; all of the filter
+PARTS = ("search", "match", "start", "update", "filter")  # templates; ...; new landmarks; patches; all of the filter
 SINGULAR = 1e12  # condition of a covariance, so much or more: no NEES
 WORLDS = ("textured_room", "textured_room_depth", "textured_room_stereo")
 LOOP = (

@@ -32,7 +32,7 @@ WATCHED = {  # the functions of a module, or of a class in it, and the part of t
     ("kalmark.slam.slam", "Slam", "process"): "filter",
     ("kalmark.simulate", "", "simulate"): "log",
     ("kalmark.results.record", "", "record"): "recording",
-    ("kalmark.results.unmeasured", "Foresight", "_ask"): "recording",
+    ("kalmark.results.unmeasured", "ExpectationRecorder", "_ask"): "recording",
     ("kalmark.cli.run", "", "judge"): "verdict",
     ("kalmark.results.run", "Run", "save"): "files",
     ("kalmark.results.report", "", "report_html"): "page",

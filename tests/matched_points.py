@@ -56,7 +56,7 @@ class Asked:
         self.ids = (None,) * len(points.v) if ids is None else ids
         tracks = SimpleNamespace(confirmed=names, known=())
         self.scan = SimpleNamespace(adrift=adrift, dimensions=2, tracks=tracks)
-        self.learned = self.time = 0.0
+        self.reobserved = self.time = 0.0
 
     def dof(self) -> int:
         """Return the size of an innovation."""
@@ -67,12 +67,12 @@ class Asked:
         return (int(self.time),)
 
     def experience(self) -> float:
-        """Return that nothing was learned."""
+        """Return that no observation was of landmarks just seen."""
         return 0.0
 
-    def learn(self, again: float) -> None:
-        """Keep what is learned."""
-        self.learned = again
+    def count_reobserved(self, again: float) -> None:
+        """Keep the count."""
+        self.reobserved = again
 
     def nearest(self, nearest: int, farther: float, gate: float) -> None:
         """Return that the other questions have to be asked."""

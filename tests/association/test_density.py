@@ -100,10 +100,10 @@ def test_sightings_of_landmarks_just_seen_make_more_of_them_likely_and_say_nothi
 
 def test_experience_is_forgotten_where_something_is_learned_and_only_there() -> None:
     tracks = Tracks(["r"])
-    tracks.learn(2.0)
-    tracks.learn(0.0)
+    tracks.count_reobserved(2.0)
+    tracks.count_reobserved(0.0)
     assert tracks.experience == 2.0
-    tracks.learn(1.0)
+    tracks.count_reobserved(1.0)
     assert tracks.experience == pytest.approx(2.8)
 
 

@@ -106,7 +106,7 @@ def test_an_average_has_both_shifts_with_equal_weights() -> None:
 def test_a_scan_with_a_clear_pose_teaches_how_many_were_of_landmarks_just_seen() -> None:
     asked: Any = Asked(CLEAR, NAMES)  # |Z| / |R| = 4 for each
     km.association.Automatic().associate(asked)
-    assert asked.learned == 2
+    assert asked.reobserved == 2
 
 
 def test_what_no_landmark_explains_from_where_the_others_are_seen_is_new() -> None:

@@ -149,7 +149,7 @@ def test_poses_are_kept_as_long_as_a_later_edge_names_them(tmp_path: Path) -> No
     slam, log = opened(written(tmp_path / "a.g2o", edges))
     loops = [(a, b) for a, b, _, _ in edges if b - a > 1]
     last = {a: max(b for one, b in loops if one == a) for a, _ in loops}
-    slam.foresee(log.events)
+    slam.prepare_for(log.events)
     for event in log:
         slam.process(event)
         now = event.t_ns // 10**9

@@ -130,7 +130,7 @@ def test_a_run_with_loops_that_is_written_read_and_resumed_is_the_same(tmp_path:
     ends_alike([km.Slam(robot()), km.Slam(robot())], log, again.events, 80, tmp_path / "map.kmk")
     foreseeing = [km.Slam(robot(keep=0)), km.Slam(robot(keep=0))]
     for slam in foreseeing:
-        slam.foresee(log)
+        slam.prepare_for(log)
     ends_alike(foreseeing, log, again.events, 80, tmp_path / "map.kmk")
 
 

@@ -107,7 +107,7 @@ def test_the_clone_of_now_is_the_last_one_of_that_time_until_the_robot_moves() -
     numbers = {name: clones.enter(slot, name, 10) for name, slot in (("r", 7), ("s", 8))}
     assert (clones.now("r", 10), clones.now("s", 10), clones.now("r", 11)) == (numbers["r"], numbers["s"], None)
     assert clones[numbers["s"]] == 8
-    clones.moved("r")
+    clones.forget_current("r")
     assert (clones.now("r", 10), clones.now("s", 10)) == (None, numbers["s"])
     assert clones.refer(EYE, [numbers["r"]]) == [8], "nothing refers to the other one"
     assert clones.now("s", 10) is None

@@ -108,9 +108,9 @@ def test_landmarks_of_one_scan_are_covisible_and_the_most_recent_are_last() -> N
 def test_what_was_learned_counts_nine_tenths_from_scan_to_scan() -> None:
     tracks = Tracks(["r"])
     for _ in range(200):
-        tracks.learn(3.0)
+        tracks.count_reobserved(3.0)
     assert tracks.experience == pytest.approx(3.0 / (1 - 0.9))
-    tracks.learn(0.0)
+    tracks.count_reobserved(0.0)
     assert tracks.experience == pytest.approx(30.0)
 
 

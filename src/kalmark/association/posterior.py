@@ -2,9 +2,10 @@
 
 A matching of c pairs has the likelihood N(v; 0, Z) of its joint innovation, linearised where the scan itself would be,
 times the density of what is not in the map for each observation that it leaves without a pair: that of the landmarks
-near it (`geometry/density.py`).  What shares of a scan are of landmarks just seen, of others of the map, and of none
-have a prior Dirichlet(1/2 + a, 1/2, 1/2): Jeffreys', rather all or nothing, and the `experience` of a observations that
-lately were of landmarks just seen.  The prior of older ones does not depend on these.
+near it (`geometry/density.py`).  The shares of a scan that are of landmarks just seen, of other landmarks of the map,
+and of no landmark have the prior Dirichlet(1/2 + a, 1/2, 1/2): Jeffreys' prior, which favours shares near 0 and 1, and
+a observations of landmarks just seen in the last scans, the `experience`.  The share of the other landmarks among all
+that are not just seen has the prior Beta(1/2, 1/2) for every a.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ def posterior(
     together: Candidates, open_: Index, d2: Array, near: Flags, just: Flags, p: int, gate: float, most: int,
     experience: float,
 ) -> Posterior:  # fmt: skip
-    """Return what is known of the matchings of the observations `open_` with the landmarks.
+    """Return the posterior of the matchings of the observations `open_` with the landmarks.
 
     d2 (K, L) are the squared distances of all pairs, `near` those that may be, `just` those of landmarks just seen;
     `gate` is the probability with which a right matching is let through.  At most so many trials are made.

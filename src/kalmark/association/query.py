@@ -33,12 +33,12 @@ def log_volume_ratio(Z: Array, R: Array) -> Array:
 class Query:
     """One scan before it is fused: the queries of an association about it.
 
-    `learned` is the number of observations without ids that are likely of landmarks just seen.
+    `reobserved` is the expected number of observations without ids that are of landmarks just seen.
     """
 
     def __init__(self, scan: ScanContext) -> None:
         self.scan, self.ids, self.y = scan, scan.ids, scan.y
-        self.learned = 0.0
+        self.reobserved = 0.0
         self._pairs: Pairs | None = None  # near each other, of the last query for candidates,
         self._names: list[Id] = []  # and the landmarks of these
         self._known = scan.tracks.known  # exactly, and outside the map
@@ -51,9 +51,9 @@ class Query:
         """Return how many of the last observations without ids were of landmarks just seen."""
         return self.scan.tracks.experience
 
-    def learn(self, again: float) -> None:
-        """Set the number of observations without ids that are likely of landmarks just seen."""
-        self.learned = float(again)
+    def count_reobserved(self, again: float) -> None:
+        """Set the expected number of observations without ids that are of landmarks just seen."""
+        self.reobserved = float(again)
 
     def key(self) -> tuple[int, ...]:
         """Return numbers, at least 0, that differ from those of all other scans."""

@@ -68,7 +68,7 @@ class Weighing(Gated):
         fit, far = d2 <= gate, chi2_gate(self.new_gate, query.dof())
         lost = query.scan.adrift or expected_in_gate(np.where(just, np.inf, d2), gate, query.dof()).max() > 1
         if not lost and not fit[~just].any() and max(fit.sum(axis=0).max(), fit.sum(axis=1).max()) <= 1:
-            query.learn(fit.sum())
+            query.count_reobserved(fit.sum())
             return Matched(np.where(fit.any(axis=1), fit.argmax(axis=1), -1), {})
         near: Flags = np.isfinite(d2) if lost else fit  # far off, the distances themselves are not valid
         search = self.gate, self.most_nodes, query.experience()
@@ -83,7 +83,7 @@ class Weighing(Gated):
         for row in np.flatnonzero(pairs == -1).tolist() if (pairs >= 0).any() else ():
             if least_increase(together, open_, pairs, row, np.flatnonzero(d2[row] <= far)) > far:
                 pairs[row], reasons[row] = NEW, "no landmark fits there, from where the others are seen"
-        query.learn(found.again(just) if found.finished else 0.0)
+        query.count_reobserved(found.again(just) if found.finished else 0.0)
         return Matched(pairs, reasons, mixed)
 
     def remapped(self, d2: Array, gate: float, far: float, reasons: dict[int, str]) -> Matched:

@@ -216,9 +216,9 @@ class _Importer:
             own = pose.frame if self.in_space(topic.robot) else pose_in_plane(pose.frame)
             self.kept(self.paths, received, topic.robot, t_ns, own)
         else:
-            self.moved(received, topic, offer, pose, t_ns)
+            self.add_odometry_pose(received, topic, offer, pose, t_ns)
 
-    def moved(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
+    def add_odometry_pose(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
         """Take a pose of odometry: the increment from the one before it."""
         before = self.last.get(received.topic)
         if not self.out.is_next(received, before and before[0], t_ns, "poses"):

@@ -192,7 +192,7 @@ def score(slam: Slam, simulated: Simulation, steps: Sequence[int], map_every: in
     and at the last.  A filter that refuses to go on has diverged.
     """
     scorer = _Scorer(slam, simulated, steps, map_every)
-    slam.foresee(simulated.log.events)
+    slam.prepare_for(simulated.log.events)
     stopped = ""
     for event in simulated.log.events:
         try:

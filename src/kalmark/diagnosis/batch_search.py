@@ -155,8 +155,8 @@ def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:
 def gated_noise_factors(run: Run) -> dict[Where, Array]:
     """Return by what factor (p,) the noise that a sensor's gate leaves is smaller than that of all its observations.
 
-    A gate leaves innovations of covariance k Z (`cut_off`).  Their noise has then R - (1 - k) R Z^-1 R, of which the
-    shares that R has of Z on the diagonals are taken here.
+    A gate leaves innovations of covariance k Z (`truncated_variance`).  Their noise then has the covariance
+    R - (1 - k) R Z^-1 R; its factor is taken from the diagonals of R and Z.
     """
     h, found = run.history, {}
     robots = h.robot[h.step]

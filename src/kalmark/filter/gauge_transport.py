@@ -1,13 +1,13 @@
 """The blocks that a correction of the invariant filter turns, and their rotation.  docs/invariant.md.
 
-The map turns with the sensor that observes it: the gauge.  A vector that depends on a lever arm, or on the heading of
-another inertial unit, turns with that.  With the rotation errors of the observing robot and of other units r, and an
-arm a,
+The map turns with the sensor that observes it: the gauge.  The error d of a vector of the world may be correlated with
+the error of a lever arm a, or with the rotation errors of other inertial units r relative to the observing robot:
 
-    d = ... + L_a d_a + L_r (d_theta_r - d_theta) + residual
+    d = L_a d_a + L_r (d_theta_r - d_theta) + e,    L = Cov(d, .) Cov(., .)^-1
 
-of each vector of the world, by the covariance before the correction.  It becomes E d of the dependent part, E the turn
-of the robot that has the arm, or of r; a turn of the whole world changes no difference, so nothing is lost of it.
+is its linear regression by the covariance before the correction, e its residual, which is uncorrelated with them.  The
+transport turns the dependent part by E, the turn of the robot that has the arm, or of r, and e with the map.  A turn of
+the whole world changes no difference of rotations.
 Where the map turns with a sensor, the position of its robot depends on arm and rotation of the mount.
 """
 
@@ -157,12 +157,12 @@ def gauge(mean: Array, correction: Array, turning: Turning, axes: int) -> Array:
 def regression_on_units(
     B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array, rays: bool
 ) -> Array:
-    """Return L (n, m): regression of each vector of some atoms on the m rows of a mount and of other units' rotations.
+    """Return L (n, m): linear regression of each vector of some atoms on the m rows of a mount and of other units.
 
     `B` (k, n) are the rows of P, before the correction, of all rows that turn; `index` are these rows, R that of the
-    robot's rotation.  The rotation of the sensor explains its part, too.  On a mount that turns the map the
-    position of its own robot alone depends, and with `rays` in the map no vector: their parallaxes count from that
-    position.
+    robot's rotation.  The sensor's rotation is among the regressors, without a column of L.  On a mount that turns
+    the map only the position of its own robot depends, and with `rays` in the map no vector: their parallaxes are
+    relative to that position.
     """
     _rows, turns, arm = turning
     m, (t, s) = len(index) - axes, (1, 2) if axes == 1 else (3, 3)

@@ -92,7 +92,7 @@ class Attention:
         found: list[int] = (cell[:, 1] * counts[0] + cell[:, 0]).tolist()
         return found
 
-    def hopeless(self, searched: int, matched: int, fitted: int) -> str:
+    def removal_reason(self, searched: int, matched: int, fitted: int) -> str:
         """Return why a landmark searched, found and fitted so often is removed, "" if it is not."""
         if searched < self.searches:
             return ""

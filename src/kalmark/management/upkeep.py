@@ -72,7 +72,7 @@ class Upkeep:
         """Return whether a tentative landmark seen so often is one."""
         return hits >= self.confirm
 
-    def hopeless(self, hits: int, chances: int) -> bool:
+    def deletes(self, hits: int, chances: int) -> bool:
         """Return whether a tentative landmark seen in `hits` of `chances` scans cannot become one any more."""
         return hits + max(self.within - chances, 0) < self.confirm
 

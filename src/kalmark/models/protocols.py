@@ -438,10 +438,10 @@ class Drifting(Capability, Protocol):
 
 @runtime_checkable
 class Distant(Capability, Protocol):
-    """A sensor whose measurements determine the distance."""
+    """A sensor each of whose measurements determines a distance: a range, or a received signal strength."""
 
     def distances(self, y: Array) -> Array:
-        """Return the distances (K,) in m that measurements y (K, m) stand for."""
+        """Return the distances (K,) in m of measurements y (K, m); in the plane, those along the plane."""
 
 
 def distances_alone(sensor: Sensor) -> bool:

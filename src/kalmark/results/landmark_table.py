@@ -12,7 +12,7 @@ tag         x y z qx qy qz qw               x y z, rotation vector      7, 6
 ==========  ==============================  ==========================  =====
 
 Whatever else a landmark is in the map (inverse depth, homogeneous, Pluecker), its model says where that is: by `place`,
-lines by `endpoints` at the abscissas of their ends (`kalmark.models.protocols.Placed`, `Segmented`).
+lines by `endpoints` at the abscissas of their ends (`kalmark.models.protocols.HasPlace`, `Segmented`).
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ from kalmark.results.recording import KNOWN, LogReference
 from kalmark.results.repeated_landmarks import repeat_rows
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
-from kalmark.results.unmeasured import Foresight
+from kalmark.results.unmeasured import ExpectationRecorder
 from kalmark.slam.description import plain_value
 from kalmark.slam.held_control import HeldInput
 
@@ -83,10 +83,10 @@ def record(
     log = log if isinstance(log, Log) else Log("", tuple(slam.robots), list(log), format="")
     refuse_other_columns(slam, log)
     refuse_other_times(log)
-    slam.foresee(log.events)
+    slam.prepare_for(log.events)
     recorder = _Recorder(slam, log, pictures)
     begin = time.perf_counter()
-    with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.foresight:
+    with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.expectations:
         for event in track(log.events, log.name or "log", len(log.events), show=progress, note=recorder.rate):
             try:
                 recorder.process(event)
@@ -144,7 +144,9 @@ class _Recorder:
         self.stepped_by, self.stepped = next((step for step in steps if step[1] & kinds), steps[-1])
         scans = sum(type(e) in self.stepped for e in log.events)
         self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS if pictures else 0)
-        self.foresight = Foresight(slam, scans if pictures else 0, np.floor(self.snapshot_at).astype(int).tolist())
+        self.expectations = ExpectationRecorder(
+            slam, scans if pictures else 0, np.floor(self.snapshot_at).astype(int).tolist()
+        )
         self.anchored = len(slam.landmarks()) > 0 or any(type(e) is Fix for e in log.events)
         begins = {name: begins_at(log.events, name, robot.motion.held) for name, robot in slam.robots.items()}
         self.starts = tuple(
@@ -188,7 +190,7 @@ class _Recorder:
         try:
             report = self.slam.process(event)
         finally:
-            self.spent_ns += time.perf_counter_ns() - start - self.foresight.spent_ns()
+            self.spent_ns += time.perf_counter_ns() - start - self.expectations.spent_ns()
         self.gaps += report.gaps
         if type(event) is Control:
             number, first_ns, _ = self.controls.get(event.robot, (0, event.t_ns, 0))
@@ -214,7 +216,7 @@ class _Recorder:
         self.spent_ns, self.compiler.was_busy = 0, False
         self.dead.append(self.reckoned[event.robot].at(event.t_ns))
         self.scans.append(scan)
-        self.foresight.keep(len(self.reports), report)
+        self.expectations.keep(len(self.reports), report)
         self.reports.append(report)
         self.states.append((self.slam.mean(event.robot), self.slam.covariance(event.robot)))
         models = [
@@ -309,7 +311,7 @@ class _Recorder:
             repeats=repeat_rows(self.slam),
             stepped=self.stepped_by,
             **decisions(reports, 3 if any(space.world == "space" for space in spaces) else 2),
-            **self.foresight.columns(m, p),
+            **self.expectations.columns(m, p),
         )
 
 

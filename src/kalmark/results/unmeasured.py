@@ -24,10 +24,10 @@ LOOKED_AT = 200  # landmarks of the map that are examined, a scan: with a larger
 KNOWN = ("associated", "new", "rejected")
 
 
-class Foresight:
-    """Context in which the landmarks in view are found before the scans of a filter.
+class ExpectationRecorder:
+    """Context that records the expected landmarks in view before scans of a filter.
 
-    The scans in `shown` are always among those.
+    The scans in `shown` are always among these.
     """
 
     def __init__(self, slam: Slam, scans: int, shown: Iterable[int] = ()) -> None:

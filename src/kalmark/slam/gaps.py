@@ -74,7 +74,7 @@ class Gaps:
         if self.last_ns is not None:
             self.pending = (*self.pending, (control.t_ns - self.last_ns, control.u))
             if len(self.pending) == LEARNED:
-                self._learn()
+                self._update_intervals()
         self._go_on(control.t_ns)
 
     def forget(self) -> None:
@@ -116,7 +116,7 @@ class Gaps:
         if self.last_ns is not None and self.bound_ns is not None:
             self.late_ns = self.last_ns + self.bound_ns
 
-    def _learn(self) -> None:
+    def _update_intervals(self) -> None:
         times = np.array([dt for dt, _ in self.pending])
         kept = times if self.bound_ns is None else np.minimum(times, self.bound_ns)  # a gap changes little
         self.intervals = (*self.intervals, *kept.tolist())[-RECENT:]

@@ -62,8 +62,8 @@ class LastMeasurement:
         m = y.shape[1]
         return cls(y, ids, *np.zeros((4, m)))
 
-    def moved(self, part: MotionPart) -> None:
-        """Take a part of a control of the robot."""
+    def add_motion(self, part: MotionPart) -> None:
+        """Add the motion of a part of a control, with its variances."""
         u, N = (part.u * part.dt_s, part.N * part.dt_s**2) if part.dt_s > 0.0 else (part.u, part.N)
         if len(self.went) != len(u):
             self.went, self.doubt = np.zeros(len(u)), np.zeros(len(u))

@@ -207,7 +207,7 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     mounts += [reader.mount for (robot, _), reader in state.readers.items() if robot == name]
     slots = [moving.slot, *(slot for slot in (moving.bias, *mounts) if slot is not None and slot >= 0)]
     write_blocks(state.map, slots, *sum_.moments(slots))
-    state.clones.moved(name)
+    state.clones.forget_current(name)
 
 
 def decide(
@@ -250,7 +250,7 @@ def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Arr
     to_robot = frames3d.compose(frames3d.inverse(channel.pose(state.map, slot))[0], r[:7])[0]
     state.map.predict(state.map.index(slot)[:6], np.zeros((6, 6)), cov)
     state.map.set_predicted(slot, np.append(frames3d.compose(T, to_robot)[0], r[7:]))
-    state.clones.moved(name)
+    state.clones.forget_current(name)
 
 
 def inflate_covariance(state: State, name: str, landmarks: Sequence[Id], factor: float) -> None:

@@ -64,7 +64,7 @@ def _give_up(state: State, scan: ScanContext, policy: Policy, found: dict[Id | N
             if found.get(track.id) == "ignored":
                 continue
             track.searched, track.found = track.searched + 1, track.found + (track.id in found)
-            reason = policy.attention.hopeless(track.searched, track.found, track.observations)
+            reason = policy.attention.removal_reason(track.searched, track.found, track.observations)
             if reason:
                 state.remove(track.id)
                 scan.report.removed += ((track.id, reason),)

@@ -62,9 +62,9 @@ def move(state: State, name: str, part: MotionPart) -> None:
         raise _nowhere(state, name, part)
     for key, given in state.given.items():
         if key[0] == name:
-            given.moved(part)
+            given.add_motion(part)
     if name in state.alternatives and not state.alternatives[name].move(state.estimator, part):
         del state.alternatives[name]
     if name in state.sums and not state.sums[name].move(state.estimator, part):
         del state.sums[name]
-    state.clones.moved(name)
+    state.clones.forget_current(name)

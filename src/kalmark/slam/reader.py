@@ -39,7 +39,7 @@ class StateReader:
     """A sensor of the state of a robot that moves by `motion`; `mount` is the slot of its mount, -1 for none.
 
     `counts`: what it measures counts from its last scan, where a clone of the robot's pose was left, or, by an id that
-    is its time, from another of the last `keep`, or of those that it has to `foresee` where that is 0.  `standing`
+    is its time, from another of the last `keep`, or of those that it has to `prepare_for` where that is 0.  `standing`
     is the detector of rest of a `zero_velocity`.
     `is_position`: like a fix it determines where a lost robot is.
     """
@@ -104,8 +104,8 @@ class StateReader:
             )
         return begins
 
-    def foresee(self, scans: Iterable[Scan]) -> None:
-        """Take note of the readings of a whole log: a pose is kept as long as later ones count from it, if `keep` is 0.
+    def prepare_for(self, scans: Iterable[Scan]) -> None:
+        """Note until when the readings of a whole log refer to each pose: it is kept until then, if `keep` is 0.
 
         The estimates are those that any other number of poses gives.
         """

@@ -229,9 +229,9 @@ class Slam(Estimate):
         report = self._found(scan)
         report.gaps += gaps
         report.removed = (*removed, *report.removed)
-        front_end.learn(report, channel.pose(state.map, state.moving[event.robot].slot))
+        front_end.update(report, channel.pose(state.map, state.moving[event.robot].slot))
         if isinstance(channel.landmark, UnknownDepth) and channel.landmark.prior_rho_per_m > 0.0:
-            begun = front_end.begun(channel.landmark.prior_rho_per_m)
+            begun = front_end.frames_to_filter_again(channel.landmark.prior_rho_per_m)
             if begun is not None:
                 self._begin_again(front_end, *begun)
         return report
@@ -249,7 +249,7 @@ class Slam(Estimate):
             again._found(scan)
             poses.append(channel.pose(state.map, state.moving[key[0]].slot))
         channel.rho = {}
-        front_end.moved(poses, state.tracks.confirmed.keys())
+        front_end.replace_poses(poses, state.tracks.confirmed.keys())
         state.front_ends = self.state.front_ends
         self.state = state
 
@@ -326,7 +326,7 @@ class Slam(Estimate):
         else:
             query = Query(scan)
             decisions = self._decided(policy, query, located.decisions)
-        state.tracks.learn(query.learned)
+        state.tracks.count_reobserved(query.reobserved)
         names = [name for name, _ in decisions]
         groups = state.tracks.by_model(scan.channel, names, scan.event.robot)
         exact = correct_by_known(state, scan, policy, decisions) if state.tracks.known else []
@@ -346,7 +346,7 @@ class Slam(Estimate):
         if len(found) < len(decisions):
             seen = {o.index: o for o in found}
             used = [k for group in exact for k in group.rows] + [k for _, rows in groups for k in rows]
-            self._start(scan, policy, used, decisions, seen)
+            self._initialize_landmarks(scan, policy, used, decisions, seen)
             found = list(seen.values())
         scan.report.observations = tuple(found)
 
@@ -358,16 +358,16 @@ class Slam(Estimate):
         except np.linalg.LinAlgError:
             return [(None, SINGULAR) if i is None else (i, "") for i in query.ids]
 
-    def _start(
+    def _initialize_landmarks(
         self, scan: ScanContext, policy: Policy, known: list[int], decisions: Sequence[Decision],
         seen: dict[int, Observation],
     ) -> None:  # fmt: skip
-        """Decide what becomes of the observations of no landmark: tentative, pending, new, or left alone."""
+        """Decide on the observations without a landmark: tentative, pending, new, or ignored."""
         state = self.state
         new = [k for k in range(len(decisions)) if k not in seen]
         confirmed = tentative.confirm_tentative(state, scan, policy, new, decisions, seen)
         left = [k for k in new if k not in seen and k not in confirmed]
-        for o in starting.start_delayed(state, scan, policy, left, decisions):
+        for o in starting.initialize_delayed(state, scan, policy, left, decisions):
             seen[o.index] = o
         if confirmed:
             by_name = [confirmed.get(k, (None, "")) for k in range(len(decisions))]
@@ -379,17 +379,17 @@ class Slam(Estimate):
         reasons = reasons_against_start(scan, policy.attention, policy.starts, new, known, decisions)
         for k in new:
             name, reason = (decisions[k][0], decisions[k][1]) if k not in reasons else (None, reasons[k])
-            seen[k] = starting.initialize(state, scan, policy, k, name, reason)
+            seen[k] = starting.initialize_landmark(state, scan, policy, k, name, reason)
 
     # ------------------------------------------------------------------ editing the map
-    def foresee(self, events: Sequence[Event]) -> None:
-        """Take note of what a log to come has: ids, and which scans readings of an `odometer` with `keep` 0 count from.
+    def prepare_for(self, events: Sequence[Event]) -> None:
+        """Prepare for a log: reserve its ids, and note the scans that readings of an `odometer` with `keep` 0 refer to.
 
-        No landmark without an id is then named like one of the ids, and no other clones are kept.
+        No landmark without an id then gets one of these ids as its name, and only the clones of these scans are kept.
         """
         readers, scans = self.state.readers, [event for event in events if isinstance(event, Scan)]
         for key, reader in readers.items():
-            reader.foresee(scan for scan in scans if (scan.robot, scan.sensor) == key)
+            reader.prepare_for(scan for scan in scans if (scan.robot, scan.sensor) == key)
         tracks, ids = self.tracks, (i for e in scans if (e.robot, e.sensor) not in readers for i in e.ids or ())
         tracks.reserve(i for i in ids if i not in tracks.confirmed and i not in tracks.tentative)
 

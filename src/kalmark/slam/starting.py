@@ -26,15 +26,15 @@ AGAIN = "started again: its mount leaves open from where it was seen before"
 SINGULAR = "what it may be cannot be computed: a matrix is singular"
 
 
-def initialize(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
-    """Add a landmark, if its measurement determines it."""
+def initialize_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
+    """Initialize a landmark by one measurement, or return the observation with the reason against it."""
     try:
-        return _initialized(state, scan, policy, k, name, reason)
+        return _add_landmark(state, scan, policy, k, name, reason)
     except np.linalg.LinAlgError:
         return Observation(k, scan.ids[k], "ignored", None, None, SINGULAR)
 
 
-def _initialized(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
+def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name: Any, reason: str) -> Observation:
     """Add a landmark: L = g(R, S, y), P_LL = G_r P G_r' + G_y R G_y'.  [S] (32)-(38)."""
     channel, id_ = scan.channel, scan.ids[k]
     refusal = _refusal(state, scan, policy, k, name, reason)
@@ -168,7 +168,7 @@ def _take(state: State, scan: ScanContext, k: int, track: Track, step: Step) -> 
     state.release(scan.key)
 
 
-def start_delayed(
+def initialize_delayed(
     state: State, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision]
 ) -> list[Observation]:
     """Keep measurements of no landmark as pending; start the landmarks that enough of them determine.  [T] 2."""

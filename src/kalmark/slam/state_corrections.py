@@ -141,7 +141,7 @@ def _record_position(state: State, name: str, y: Array, R: Array, done: Correcti
         _doubt(state, name, found, done, R, fits)
         return 0.0
     state.placed = replacing.NEEDED
-    state.clones.moved(name)
+    state.clones.forget_current(name)
     state.alternatives.clear()
     moving.left_out.clear()
     return float(np.linalg.norm(state.map.mean(moving.slot)[: len(y)] - mean[: len(y)]))

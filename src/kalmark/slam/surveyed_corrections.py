@@ -76,9 +76,10 @@ def correct_by_surveys(
 
 
 def _widen(state: State, scan: ScanContext, before: Array) -> None:
-    """Raise the covariance of a robot that was elsewhere to the change of its state: it was too small.
+    """Add to the covariance of a robot the squares of `WIDER` times the change of its state since `before`.
 
-    The change that its covariance allows is too small at first, but doubles from time to time.
+    One correction moves a robot that is elsewhere by what its covariance allows: too little.  With the change added
+    each time, the next correction moves it farther, at most `DOUBLED` times.
     """
     after, d, dof = state.map.mean(scan.robot), scan.dimensions, scan.channel.pose_dof
     turn = after[2] - before[2] if d == 2 else 2.0 * math.acos(min(1.0, abs(float(after[3:7] @ before[3:7]))))

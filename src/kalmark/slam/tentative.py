@@ -193,7 +193,7 @@ def drop(state: State, scan: ScanContext, policy: Policy) -> None:
         tentative[name].chances += 1
     for name in missed:
         track = tentative[name]
-        if u.hopeless(track.hits, track.chances) or track.unseen > confirm.OUT_OF_VIEW * u.within:
+        if u.deletes(track.hits, track.chances) or track.unseen > confirm.OUT_OF_VIEW * u.within:
             why = f"tentative: seen in {track.hits} of {track.chances} scans"
             scan.report.removed += ((name, why),)
             _forget(state, track)

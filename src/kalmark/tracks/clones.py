@@ -78,8 +78,8 @@ class Clones:
         clone = None if number is None else self.clones.get(number)
         return number if clone is not None and clone.t_ns == t_ns else None
 
-    def moved(self, robot: str) -> None:
-        """Take note that a robot has moved: no clone is of where it is now."""
+    def forget_current(self, robot: str) -> None:
+        """Forget which clone is the current pose of a robot, after a motion."""
         self.latest.pop(robot, None)
 
     def enter(self, slot: int, robot: str, t_ns: int) -> int:

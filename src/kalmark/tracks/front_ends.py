@@ -52,8 +52,8 @@ class FrontEnd(Protocol):
         """
         ...
 
-    def learn(self, report: Report, T: Array) -> None:
-        """Take the report of the last frame, whose sensor is at T (7,)."""
+    def update(self, report: Report, T: Array) -> None:
+        """Update the views of landmarks by the report of the last frame; T (7,) is its sensor's pose."""
         ...
 
     def watch_beginning(self) -> None:
@@ -68,15 +68,15 @@ class FrontEnd(Protocol):
         """Search for a landmark known beforehand, too."""
         ...
 
-    def begun(self, prior: float) -> tuple[list[tuple[Scan, list[Id]]], dict[Id, float]] | None:
-        """Return the frames so far, each with the landmarks given up before it, if they are to be filtered again.
+    def frames_to_filter_again(self, prior: float) -> tuple[list[tuple[Scan, list[Id]]], dict[Id, float]] | None:
+        """Return the frames so far, if they are to be filtered again, each with the landmarks removed before it.
 
         And inverse distances of landmarks, 1/m, at which these are to start then; their median is the `prior`.
         """
         ...
 
-    def moved(self, poses: list[Array], names: Set[Id]) -> None:
-        """Replace the poses (7,) of the sensor in the frames so far, and keep only `names` as landmarks."""
+    def replace_poses(self, poses: list[Array], names: Set[Id]) -> None:
+        """Set the poses (7,) of the sensor in all frames so far, one a frame, and remove all landmarks but `names`."""
         ...
 
 

@@ -242,7 +242,7 @@ class Tracks:
             self.recent = [name for name in self.recent if name not in names][-RECENT:] + names
             self.last_scan = names
 
-    def learn(self, again: float) -> None:
+    def count_reobserved(self, again: float) -> None:
         """Count the observations of a scan that were of landmarks just seen, with a forgetting factor."""
         if again > 0:
             self.experience = FORGETTING * self.experience + again

@@ -116,7 +116,7 @@ class FrontEnd:
         self.prospect: Prospect | None = None
         self.image: Any = None
         self.sighting: Sighting | None = None
-        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
+        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "update"), 0.0)
 
     def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Prospect:
         """Return what the sensor should measure of the landmarks in view, jointly."""
@@ -179,7 +179,7 @@ class FrontEnd:
         self.sighting = Sighting(scan, removed, drifted)
         return self.sighting
 
-    def learn(self, report: Report, T: Array) -> None:
+    def update(self, report: Report, T: Array) -> None:
         """Learn from what became of a frame, its sensor at T (7,) now: patches, and which landmarks fitted."""
         t0 = perf_counter()
         assert self.prospect is not None
@@ -215,7 +215,7 @@ class FrontEnd:
             fitted = {o.landmark: report.y[o.index] for o in report.observations
                       if o.landmark is not None and o.outcome in ("new", "associated")}  # fmt: skip
             self.beginning.add(self.sighting.scan, [name for name, _ in self.sighting.removed], fitted, T)
-        self.times["learn"] += perf_counter() - t0
+        self.times["update"] += perf_counter() - t0
 
     # ------------------------------------------------------------------ the beginning
     def watch_beginning(self) -> None:
@@ -223,7 +223,7 @@ class FrontEnd:
         if isinstance(self.sensor, PinHole):
             self.beginning = Beginning()
 
-    def begun(self, prior: float) -> Begun | None:
+    def frames_to_filter_again(self, prior: float) -> Begun | None:
         """Return, once, how the map begins, as soon as the first frames tell; the median of rho is the `prior`, 1/m."""
         if self.beginning is None:
             return None
@@ -232,8 +232,8 @@ class FrontEnd:
             self.beginning = None
         return found
 
-    def moved(self, poses: list[Array], names: Set[Id]) -> None:
-        """Take over that the sensor was at other poses (7,) in all frames so far, and that only `names` are left."""
+    def replace_poses(self, poses: list[Array], names: Set[Id]) -> None:
+        """Set the poses (7,) of the sensor in all frames so far, one a frame, and remove all landmarks but `names`."""
         self.looks = {name: look for name, look in self.looks.items() if name in names}
         for look in self.looks.values():
             look.views = [replace(view, T=poses[view.frame]) for view in look.views]

@@ -97,7 +97,7 @@ class LineFrontEnd:
         self.found: Matches | None = None
         self._numbers: list[int] = []  # of the segments of the last scan
         self.image: Any = None
-        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "learn"), 0.0)
+        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "update"), 0.0)
 
     def recognised(self, image: Any, map_: Map, tracks: Tracks, channel: Channel) -> None:
         """Return that lines recognise no place."""
@@ -142,7 +142,7 @@ class LineFrontEnd:
         self._numbers = [*of[rows].tolist(), *new]
         return scan, removed, None
 
-    def learn(self, report: Report, T: Array) -> None:
+    def update(self, report: Report, T: Array) -> None:
         """Learn from what became of a frame: profiles of new lines, and which lines fitted."""
         t0 = perf_counter()
         assert self.found is not None
@@ -156,7 +156,7 @@ class LineFrontEnd:
             look.seen = self.frame
         for name, _ in report.removed:
             self.looks.pop(name, None)
-        self.times["learn"] += perf_counter() - t0
+        self.times["update"] += perf_counter() - t0
 
     def _detected(self, image: Any) -> Array:
         """Return the segments (M, 4) of an image."""
@@ -201,10 +201,10 @@ class LineFrontEnd:
     def survey(self, name: Id) -> None:
         """Search for a line known beforehand: its profile is not known, so that it is not found."""
 
-    def begun(self, prior: float) -> None:
+    def frames_to_filter_again(self, prior: float) -> None:
         """Return that no frame is to be filtered again."""
 
-    def moved(self, poses: list[Array], names: Set[Id]) -> None:
+    def replace_poses(self, poses: list[Array], names: Set[Id]) -> None:
         """Take over that only `names` are left."""
         self.looks = {name: look for name, look in self.looks.items() if name in names}
 
