@@ -127,6 +127,13 @@ def called(node: ast.Call) -> str:
     return str(getattr(node.func, "id", getattr(node.func, "attr", "")))
 
 
+def docstrings(tree: ast.Module) -> Iterator[str]:
+    """Yield the docstrings of a module, its classes and its functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | Function):
+            yield from filter(None, [ast.get_docstring(node)])
+
+
 def branches(node: ast.AST) -> int:
     """Return the branch points below a node: also conditional expressions, `and`, `or`, comprehensions, handlers."""
     number = 0
@@ -187,8 +194,10 @@ def counts() -> dict[str, int]:
     stems = Counter(file.stem for file in files if file.stem != "__init__")
     found = Counter(name for node in nodes for name in of_node(node))
     found.update(name for tree in trees for name in of_module(tree))
-    heads = [(ast.get_docstring(tree) or "").lower() for tree in trees]
-    found["modules that begin with a question word"] = sum(head.startswith(QUESTIONS) for head in heads)
+    heads = [text.lower().split()[0] for tree in trees for text in docstrings(tree)]
+    found["docstrings that begin with a question word"] = sum(head in QUESTIONS for head in heads)
+    homes = Counter(node.name for tree in trees for node in tree.body if isinstance(node, Function))
+    found["functions of modules that share their name"] = sum(n for n in homes.values() if n > 1)
     found["file names used more than once"] = sum(n for n in stems.values() if n > 1)
     found[f"public names of {OFTEN} functions or more"] = sum(n >= OFTEN for n in Counter(public).values())
     found["modules in the largest import cycle"] = largest_cycle(imports(modules()))

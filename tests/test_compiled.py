@@ -113,7 +113,7 @@ for file in (index, data):
     for damage in (b"", whole[:10], whole[: len(whole) // 2], whole[:-1], whole + b"0", bytes(len(whole)), *flips):
         file.write_bytes(damage)
         assert anew() == 0, "what is damaged is not loaded"
-        assert anew() == 1, "it has been made anew"
+        assert anew() == 1, "it has been made again"
         cases += 1
     (index if file is data else data).replace(file)
     assert anew() == 0 and anew() == 1, "another file under its name is not loaded"

@@ -8,7 +8,7 @@ ever needed, the call goes `by_address` instead: the callee is compiled once, al
 filter calls the models so, hence its code does not depend on theirs: each has a folder of its own.
 
 Each file of compiled code ends with the SHA-256 of its name and content.  One that is damaged or cut, or
-another one under its name, counts as none and is made anew: what numba would take out of it might do anything.
+another one under its name, counts as none and is made again: what numba would take out of it might do anything.
 
 An address is valid in the process that made it, as long as the function lives.  So it is always an argument of compiled
 code, never a constant in it that the disk would keep; a copy in another process computes its own.

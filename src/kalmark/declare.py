@@ -212,7 +212,7 @@ def options_of(function: Callable[..., Any], after: int) -> tuple[Parameter, ...
 def _hints(of: Any, include_extras: bool = True) -> dict[str, Any]:
     try:
         return get_type_hints(of, include_extras=include_extras)
-    except (NameError, TypeError):  # of a user: types that only a checker knows, or an object that is called
+    except (NameError, TypeError):  # of a user: types that only a checker can see, or an object that is called
         return {}
 
 

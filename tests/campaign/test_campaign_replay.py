@@ -1,4 +1,4 @@
-"""Replays: a log's own route and sightings, noise drawn anew: consistent where the filter is, the same for a seed."""
+"""Replays: a log's own route and sightings, noise drawn again: consistent where the filter is, the same for a seed."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ def test_800_s_among_surveyed_tags_of_which_some_stand_elsewhere(in_space: bool,
     assert not fault_of(slam.covariance("r"))
     far = wrong[2:]  # by 20 cm and more
     far = far[seen[far] > 0]
-    assert len(far) and (refused[far] > 0.9 * seen[far]).all(), "what does not fit is rejected or mapped anew"
+    assert len(far) and (refused[far] > 0.9 * seen[far]).all(), "what does not fit is rejected or mapped again"
     assert renewed <= set(wrong.tolist())
     right = np.setdiff1d(np.arange(count), wrong)
     assert refused[right].sum() < 0.05 * seen[right].sum()

@@ -59,7 +59,7 @@ def test_a_robot_without_a_covariance_is_lost_and_the_error_says_what_would_help
         m = slam.map if map_ == "dense" else slam.map.active  # type: ignore[attr-defined]
         m.P[at[0], at[0]] = variance
         with pytest.raises(
-            DivergedError, match=rf"^scan at t=1 s: the covariance of 'a' {fault}.*; start anew .*sigmas.*$"
+            DivergedError, match=rf"^scan at t=1 s: the covariance of 'a' {fault}.*; start again .*sigmas.*$"
         ):
             slam.process(seen([0, 1]))
 
@@ -102,7 +102,7 @@ class Broken(km.estimators.Ekf):
 
 def test_a_bare_linalgerror_never_comes_out() -> None:
     slam = surveyed(Broken(), "dense")
-    with pytest.raises(DivergedError, match=r"^scan at t=1 s: Singular matrix; start anew .*sigmas") as refused:
+    with pytest.raises(DivergedError, match=r"^scan at t=1 s: Singular matrix; start again .*sigmas") as refused:
         slam.process(seen([0]))
     assert "\n" not in str(refused.value)
 

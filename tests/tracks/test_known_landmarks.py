@@ -40,7 +40,7 @@ def test_the_last_takes_the_row_of_one_that_is_removed() -> None:
     of.remove(0)
     assert of.names == [3, 1, 2]
     np.testing.assert_array_equal(of.places(), [ROW[3], ROW[1], ROW[2]])
-    assert of.tree().query([0.0, 0.0])[1] == 1, "the tree is made anew"
+    assert of.tree().query([0.0, 0.0])[1] == 1, "the tree is made again"
 
 
 def test_pairs_are_found_by_how_far_apart_they_are() -> None:

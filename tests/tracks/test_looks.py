@@ -73,7 +73,7 @@ def test_a_miss_counts_by_the_share_that_is_seen_there_against_where_most_is_see
     np.testing.assert_allclose(looks.weights(cells), expected)
     looks.taken = AGAIN + 1
     looks.count(cells, np.array([True, True]))
-    np.testing.assert_allclose(looks.weights(cells), expected)  # they are found anew after eight looks
+    np.testing.assert_allclose(looks.weights(cells), expected)  # they are estimated again after eight looks
 
 
 def test_what_is_seen_always_is_taken_to_be_seen_by_98_percent() -> None:

@@ -37,7 +37,7 @@ def test_two_misfits_with_nothing_between_that_fits_are_the_robot_s() -> None:
     surveys = Surveys()
     assert [surveys.judge("r", [], [name]) for name in "aab"] == [False, False, True]
     assert surveys.misfits == {} and surveys.strangers["r"] == set()
-    assert surveys.judge("r", [], ["b"]) is False, "it begins anew"
+    assert surveys.judge("r", [], ["b"]) is False, "it begins again"
 
 
 def test_a_sighting_that_fits_between_two_misfits_or_another_robot_s_does_not_count_together() -> None:

@@ -14,13 +14,13 @@ beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].see
 
 
 def content_of_topic(bag: Bag, name: str, topic: Topic) -> Message:
-    """Return what the messages of a topic offer.  Raises LogError if that is not what the topic is to be."""
+    """Return the contents of the messages of a topic.  Raises LogError if they do not fit its section."""
     kind = bag.topics[name].type
     known = offers(kind, bag.definitions, f"log option topics: {name}", topic)
-    if known is None or not any(getattr(known, want) for want in topic.wants):
+    if known is None or not any(getattr(known, want) for want in topic.needs):
         if known is None and kind not in bag.definitions:
             raise LogError(f"{bag.path}: topic {name} has messages of the type {short(kind)}, {UNDEFINED}")
-        types = ", ".join(sorted({short(k) for k, m in MESSAGES.items() if any(getattr(m, w) for w in topic.wants)}))
+        types = ", ".join(sorted({short(k) for k, m in MESSAGES.items() if any(getattr(m, w) for w in topic.needs)}))
         what = short(kind) if known is None else f"{short(kind)} ({known.what})"
         own = ", ".join(path for path, _ in leaves(kind, bag.definitions)) if known is None else ""
         own = f", or `fields` of {own}" if own else ""

@@ -69,7 +69,7 @@ class Fields:
         return cls({name: paths[name] for name in (*order, *(name for name in paths if name not in order))})
 
     def message(self, scan: bool) -> Message:
-        """Return what can be read from a message by these fields."""
+        """Return the contents of a message by these fields."""
         if scan:
             return Message("fields", seen=self.seen)
         has, offers = {*self.paths}, dict[str, Any]()
@@ -102,7 +102,7 @@ class Fields:
         return {name: each if isinstance(each, list) else [each] * count for name, each in read.items()}
 
     def seen(self, m: Any, scan: Scans) -> Seen:
-        """Return what a sensor saw; what is not finite was not measured.  Raises Refused."""
+        """Return the observations of a sensor; a value that is not finite was not measured.  Raises Refused."""
         columns = tuple(name for name in self.paths if name != ID)
         seen, table = Seen(columns), self.table(m)
         factors = [self.paths[name][1] for name in columns]
@@ -140,7 +140,7 @@ def number_of_field(column: str, v: Any) -> float:
 
 
 def value(m: Any, path: str) -> Any:
-    """Return what is at a path of a message: a list if the path goes through an array."""
+    """Return the value at a path of a message: a list if the path goes through an array."""
     here, many = [m], False
     for name, array in re.findall(r"([^.\[]+)(\[\])?", path if hasattr(m, "msg") else path.removeprefix("msg.")):
         here = [getattr(each, name) for each in here]
@@ -150,7 +150,7 @@ def value(m: Any, path: str) -> Any:
 
 
 def offers(kind: str, definitions: Mapping[str, Any], where: str = "", topic: Topic | None = None) -> Message | None:
-    """Return what messages of a type offer: by the fields that a topic names, by its type, or by its definition.
+    """Return the contents of messages of a type: by the fields that a topic names, by its type, or by its definition.
 
     None if nothing is known.  Raises LogError.
     """

@@ -108,7 +108,7 @@ class _Writer:
         return mine or (self.spaces[0] if self.spaces else "robot")
 
     def useless(self, topic: TopicSummary) -> str:
-        """Return why a topic of observations cannot be used, "" if it can."""
+        """Return the reason against a topic of observations, "" without one."""
         frame = topic.frame.lstrip("/")
         odometries = {each.frame.lstrip("/") for each in self.usable if each.offers.twist and each.offers.pose}
         if topic.offers.seen is not None and frame and (frame in odometries or frame.split("/")[-1] in WORLD):
@@ -120,7 +120,7 @@ class _Writer:
         return topic.error or "nothing was seen"
 
     def lines(self) -> _Lines:
-        """Return what is to be written."""
+        """Return the lines to write."""
         out = _Lines()
         robots: dict[str, list[TopicSummary]] = {robot: [] for robot in self.spaces}
         for topic in self.usable:
@@ -239,7 +239,7 @@ class _Writer:
         return best, "" if best is None else "inertial"
 
     def of_control(self, topic: TopicSummary) -> str:
-        """Return why this is the control."""
+        """Return the reason for this control."""
         path = f"its path is {'flat' if topic.poses.frames and topic.poses.flat else 'not flat'}"
         if topic.offers.pose is not None and topic.poses.frames and not topic.poses.moves and topic.turns:
             return f"{topic_text(topic)}; {GUESS} its velocities, because its poses stand still"
@@ -273,7 +273,7 @@ class _Writer:
         return None
 
     def why_not(self, topic: TopicSummary) -> str:
-        """Return why a topic is not used."""
+        """Return the reason against a topic."""
         if topic.error:
             return topic.error
         if topic.offers.transforms is not None:

@@ -66,7 +66,7 @@ class Readings:
         return used
 
     def mount(self, topic: TopicSummary) -> Array | None:
-        """Return where a unit is in its robot: by tf, or turned (7,) as gravity shows; None if neither says so."""
+        """Return the mount (7,) of a unit: by tf, or its rotation by gravity; None if neither has it."""
         known = mount_of(self.found, topic, self.control)
         if known is not None or topic.frame in self.tilted:
             return known if known is not None else self.tilted[topic.frame]
@@ -78,7 +78,7 @@ class Readings:
         return self.tilted[topic.frame]
 
     def tilt(self, topic: TopicSummary) -> dict[str, Any]:
-        """Return what an entry says of a mount that gravity shows."""
+        """Return the comment of an entry on a mount by gravity."""
         if mount_of(self.found, topic, self.control) is not None or (mount := self.mount(topic)) is None:
             return {}
         turned = describe_pose(mount)
@@ -114,7 +114,7 @@ class Readings:
         return None if entry == {"type": "imu", "gyro": None} else entry
 
     def gyro(self, topic: TopicSummary, rates: Measured) -> dict[str, Any]:
-        """Return what an entry says of the rates; note their sensor."""
+        """Return the comment of an entry on the rates; record their sensor."""
         name = self.named("gyro", topic)
         sigma, why = GYRO_RADPS, f"{GUESS} its noise and its bias"
         if rates.cov is not None and rates.cov[2, 2] > 0:
@@ -151,7 +151,7 @@ class Readings:
         self.line(name, section, topic, f"{GUESS} its first heading is that of the start")
 
     def start(self) -> str:
-        """Return the line of the robot's start; a heading that nothing else tells is that of the compass."""
+        """Return the line of the robot's start; without another source, the heading is that of the compass."""
         begin = self.begin
         assert begin is not None
         at, sigmas, why = begin.at, begin.sigmas, begin.why

@@ -55,7 +55,7 @@ def section_line(found: Survey, topic: TopicSummary, control: Any, space: bool) 
 
 
 def mount_of(found: Survey, topic: TopicSummary, control: Any) -> Array | None:
-    """Return where tf has the frame of a sensor in that of its robot."""
+    """Return the pose of a sensor's frame in its robot's by tf."""
     named = control.child if isinstance(control, TopicSummary) else control[1] if control else ""
     base = found.frames.base([named], topic.frame)
     return None if base is None else found.frames.fixed(base, topic.frame)

@@ -20,9 +20,9 @@ POSE_M, POSE_RAD = 0.5, 0.2  # sigmas of positions and headings that come withou
 
 @dataclass
 class Start:
-    """Where a robot starts: x, y, heading, their two sigmas, and why.
+    """Start of a robot: x, y, heading, their two sigmas, and the source.
 
-    `north`: the map's axes are east and north; `known`: whether something tells the heading.
+    `north`: the map's axes are east and north; `known`: the heading has a source.
     """
 
     at: list[float]
@@ -33,7 +33,7 @@ class Start:
 
 
 def start_of(found: Survey, control: Any, used: Mapping[str, tuple[dict[str, Any], str]], space: bool) -> Start | None:
-    """Return a robot's start in the frame of its fixes, None if nothing tells it or true poses in that frame do."""
+    """Return a robot's start in the frame of its fixes, None if nothing or a true path in that frame determines it."""
     if control is None or space:
         return None
     fixes, true = ([found.named(name) for name, (entry, _) in used.items() if entry["type"] == kind]

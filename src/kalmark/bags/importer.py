@@ -1,4 +1,4 @@
-"""Read a bag by topic: a configuration says of each topic what it is in the log (`topics.py`, docs/bags.md)."""
+"""Import of a bag by topics: a configuration assigns to each topic its part in the log (`topics.py`, docs/bags.md)."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ class _Importer:
             self.request.refuse(f"{self.bag.path}: {at}: {refused}")
 
     def taken(self, received: Received, topic: Topic, offer: Message, t_ns: int) -> None:
-        """Take what a topic wants of a message.  Raises Refused and EventError."""
+        """Take the parts of a message that its topic is configured for.  Raises Refused and EventError."""
         if isinstance(topic, Scans):
             self.scan(received, topic, offer, t_ns)
         elif isinstance(topic, Images):
@@ -167,13 +167,13 @@ class _Importer:
             self.globe(received, topic, offer.globe(received.message), t_ns)
         elif isinstance(topic, Posed):
             self.poses(received, topic, offer, t_ns)
-        elif offer.drive is not None and "drive" in topic.wants:
+        elif offer.drive is not None and "drive" in topic.needs:
             self.control(topic, t_ns, offer.drive(received.message), None)
         elif offer.twist is not None:
             self.velocity(topic, t_ns, offer, received.message)
 
     def time(self, received: Received, topic: Topic) -> int | None:
-        """Return the time (ns) of a message, None if its header has 0, which says nothing.
+        """Return the time (ns) of a message, None if its header has 0, which is no time.
 
         Raises LogError if headers and the recorder have different clocks.
         """

@@ -82,7 +82,7 @@ def time_fields(t_ns: int) -> dict[str, int]:
 
 
 def write_mcap(path: Path, messages: Iterable[Outgoing]) -> dict[str, int]:
-    """Write messages into one MCAP file, which is there completely or not at all; return their number by topic.
+    """Write messages into one MCAP file, which is written completely or not; return their number by topic.
 
     They should come in order of time.  A time before 0, which a recorder cannot have, is recorded as 0.
     """

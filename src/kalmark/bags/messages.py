@@ -63,7 +63,7 @@ class Place(NamedTuple):
 
 @dataclass
 class Seen:
-    """What one message has of a scan: rows in the order of `columns`, ids, and what was left out by its reason."""
+    """Part of a scan in one message: rows in the order of `columns`, ids, and numbers of left-out rows by reason."""
 
     columns: tuple[str, ...]
     y: list[list[float]] | Array = field(default_factory=list)
@@ -98,7 +98,7 @@ class Transform(NamedTuple):
 
 @dataclass(frozen=True)
 class Message:
-    """What can be read from messages of one type."""
+    """Contents that can be read from messages of one type."""
 
     what: str
     pose: Callable[[Any], Pose] | None = None
@@ -181,7 +181,7 @@ def satellite_fix(m: Any) -> Place | None:
 
 
 def vector(v: Any, cov: Any) -> Measured | None:
-    """Return what an inertial unit measured along its axes, None of what it does not measure.
+    """Return the measurement of an inertial unit along its axes, None without one.
 
     Its covariance is None where it is unknown: all zeros.
     """
@@ -322,7 +322,7 @@ def cloud(m: Any, scan: Scans) -> Seen:
 
 
 def first_id(scan: Scans, *names: Any) -> Any:
-    """Return the first id that there is, as a number where it is one; None if the configuration wants none."""
+    """Return the first id, as a number where it is one; None if the configuration excludes ids."""
     text = next((str(name) for name in names if str(name)), "") if scan.ids != "none" else ""
     digits = text.removeprefix("-")
     return None if not text else int(text) if digits.isdecimal() and digits.isascii() and len(digits) < 19 else text

@@ -29,13 +29,13 @@ CURES = {
     "File end magic is invalid": f"the file ends early and has no index, expected one: {RECOVER}",
     "Unindexed MCAP messages": f"messages out of order and without an index, expected one: {RECOVER}",
 }
-"""What is said of a bag that can be mended, by what rosbags says of it."""
+"""Messages of kalmark for bags that can be repaired, by the messages of rosbags."""
 UNDEFINED = "which the bag does not define, expected its .msg file, or the text of it, in log.definitions"
 SECOND_NS = 1_000_000_000
 
 
 class Messages(NamedTuple):
-    """What a bag says of one topic: the type of its messages, as ROS 2 writes it, and how many there are."""
+    """Type, as ROS 2 writes it, and number of the messages of one topic."""
 
     type: str
     number: int

@@ -23,7 +23,7 @@ from kalmark.logs.table import Refused
 
 @dataclass
 class Gathered:
-    """What has become of messages: events, the columns of sensors (robot, name), and how many were left out and why."""
+    """Result of messages: events, the columns of sensors (robot, name), and numbers of left-out ones by reason."""
 
     events: list[Event] = field(default_factory=list)
     sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
@@ -60,7 +60,7 @@ class OwnReadings:
                 self.reading(received, *key, t_ns, columns, y)
 
     def said(self, received: Received, topic: Sparse, offer: Any) -> Iterator[tuple[str, tuple[str, ...], Any]]:
-        """Yield what a message says, in the plane made level: the sensor, its columns and their numbers."""
+        """Yield the readings of a message, in the plane made level: sensor, columns and numbers."""
         m, R = received.message, self.level.get(received.topic, (np.eye(3), False))[0]
         if isinstance(topic, Compass) and (b := self.measured(received, "field", offer.field(m))) is not None:
             heading = heading_of_field(R @ b)
@@ -82,7 +82,7 @@ class OwnReadings:
             yield topic.gravity, GRAVITY, a
 
     def measured(self, received: Received, what: str, told: Measured | None) -> Array | None:
-        """Return what a message measured; None, and counted, if it did not."""
+        """Return the measurement in a message; without one count it and return None."""
         if told is None:
             self.out.left_out[received.topic, f"messages without {what}"] += 1
             return None

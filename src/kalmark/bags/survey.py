@@ -44,7 +44,7 @@ class Poses:
 
     @property
     def flat(self) -> bool:
-        """Whether the path is one of the plane: of one height, and never tilted."""
+        """True if the path is one of the plane: of one height, and never tilted."""
         frames = np.array(self.frames)
         x, y = frames[:, 3], frames[:, 4]
         tilt = 2 * np.arcsin(np.minimum(np.hypot(x, y), 1.0))
@@ -52,7 +52,7 @@ class Poses:
 
     @property
     def moves(self) -> bool:
-        """Whether the poses differ."""
+        """True if the poses differ."""
         return bool(self.frames) and bool(np.ptp(np.array(self.frames), axis=0).max() > STILL)
 
 
@@ -60,10 +60,10 @@ class Poses:
 class TopicSummary:
     """One topic: its messages, their median rate (Hz), the longest gap (s) and when it began (s), their frames.
 
-    `gaps` counts the intervals of more than five usual ones.  `header` says whether its messages have a time of their
+    `gaps` counts the intervals of more than five usual ones.  `header` is true if its messages have a time of their
     own, which is `offset_s` behind that of the recorder in the first of them, and runs backwards by `back_s` at most;
     `unset`: that it has a place for one, and zeros in it.  `offers` is what can be read from its messages, by their
-    type or by the fields `stated`, which their definition shows.  `turns` says whether a velocity in them is not 0.
+    type or by the fields `stated`, which their definition shows.  `turns` is true if a velocity in them is not 0.
     """
 
     name: str
@@ -104,7 +104,7 @@ class TopicSummary:
 
 @dataclass
 class Survey:
-    """What is in a bag; `start_s` is the time of its first message as recorded, `pairs` the poses of moving frames."""
+    """Content of a bag; `start_s` is the time of its first message as recorded, `pairs` the poses of moving frames."""
 
     path: Path
     start_s: float
@@ -121,7 +121,7 @@ class Survey:
 
 
 def survey(path: Path, definitions: Mapping[str, str] | None = None) -> Survey:
-    """Return what is in a bag; `definitions` are those of types that it does not define.  Raises LogError."""
+    """Return the content of a bag; `definitions` are those of types that it does not define.  Raises LogError."""
     with Bag(path, definitions) as bag:
         summaries = {name: _summary(bag, name) for name in sorted(bag.topics)}
         begin, end = _rates(bag, summaries)

@@ -69,7 +69,7 @@ def messages_of_log(log: Log) -> Iterator[Outgoing]:
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON has no word for as plain numbers: arrays."""
+    """Return arrays, which JSON does not have, as lists of numbers."""
     return value.item() if isinstance(value, np.generic) else np.asarray(value).tolist()
 
 

@@ -59,7 +59,7 @@ def find(path: Path) -> Path | None:
 # ------------------------------------------------------------------ the scene
 @dataclass
 class Scene:
-    """Hold what tagslam.yaml says: sizes (m) of tags, that of all others (None: they are ignored), which body is which.
+    """Content of tagslam.yaml: sizes (m) of tags, that of all others (None: they are ignored), the names of bodies.
 
     `squashed` are (time in ns, tag) of detections to leave out, `hamming` the most corrected bits by body.
     """
@@ -80,7 +80,7 @@ class Scene:
         return None if tag in self.ignored else self.sizes.get(tag, self.other_size)
 
     def refusal(self, tag: Any, t_ns: int) -> str:
-        """Return why a detection is left out, "" if it is not."""
+        """Return the reason to leave out a detection, "" without one."""
         if self.size(int(tag.id)) is None:
             return f"detections of tag {tag.id}, which is of no body"
         if (t_ns, tag.id) in self.squashed:
@@ -90,7 +90,7 @@ class Scene:
 
 
 def read_scene(path: Path) -> Scene:
-    """Return the scene in tagslam.yaml.  Raises LogError if something in it is not as TagSLAM wants it."""
+    """Return the scene in tagslam.yaml.  Raises LogError if it does not have the form of TagSLAM."""
     content = read_mapping(path)
     try:
         scene = Scene(default_body=content.get("default_body", ""))

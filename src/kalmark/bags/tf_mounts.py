@@ -56,7 +56,7 @@ class Mounts:
             self._mount(name, asked.topics[name])
 
     def _mount(self, name: str, scan: Topic) -> None:
-        """Note where a sensor is mounted, if tf says so; in the plane also how its points are made level."""
+        """Record the mount of a sensor, if tf has it; in the plane also the rotation that levels its points."""
         assert isinstance(scan, Carried)
         frame = self.of_sensor.get(name, "")
         base = self.frames.base((scan.base_frame, self.base.get(scan.robot)), frame)

@@ -1,7 +1,7 @@
 """The meaning of a topic of a bag: the types of `log.topics.TOPIC` in a configuration, each declared once.
 
-`wants` names what the topic's messages must offer, an attribute of `kalmark.bags.messages.Message`; `columns` are
-those of the control that comes of it.
+`needs` names the content that the topic's messages must have, an attribute of `kalmark.bags.messages.Message`;
+`columns` are those of the control that comes of it.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 
 @declared
 class Topic:
-    """What all topics have: whose it is, and when it was."""
+    """Options of all topics: robot, and time."""
 
-    wants: ClassVar[tuple[str, ...]] = ()
+    needs: ClassVar[tuple[str, ...]] = ()
     columns: ClassVar[tuple[str, ...]] = ()
     space: ClassVar[bool] = False
 
@@ -47,7 +47,7 @@ class Topic:
 class Posed(Topic):
     """Poses of the robot: Odometry, PoseStamped, PoseWithCovarianceStamped, or a frame of tf."""
 
-    wants: ClassVar[tuple[str, ...]] = ("pose", "transforms")
+    needs: ClassVar[tuple[str, ...]] = ("pose", "transforms")
 
     frame: Annotated[str | None, "tf: the frame in which the pose is, such as odom."] = None
     child_frame: Annotated[str | None, "tf: the frame whose pose it is, such as base_link."] = None
@@ -93,7 +93,7 @@ class Odometry3DTopic(Moved):
 class UnicycleTopic(Topic, Noisy):
     """Speed and turn rate, held until the next message: Odometry, Twist, TwistStamped, TwistWithCovarianceStamped."""
 
-    wants: ClassVar[tuple[str, ...]] = ("twist",)
+    needs: ClassVar[tuple[str, ...]] = ("twist",)
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
 
 
@@ -101,7 +101,7 @@ class UnicycleTopic(Topic, Noisy):
 class Velocity3DTopic(Topic, Noisy):
     """Velocities in space, held until the next message: Odometry, Twist, TwistStamped, TwistWithCovarianceStamped."""
 
-    wants: ClassVar[tuple[str, ...]] = ("twist",)
+    needs: ClassVar[tuple[str, ...]] = ("twist",)
     columns: ClassVar[tuple[str, ...]] = TWIST3
     space: ClassVar[bool] = True
 
@@ -110,7 +110,7 @@ class Velocity3DTopic(Topic, Noisy):
 class AckermannTopic(Topic):
     """Speed and steering angle, held until the next message: AckermannDrive, AckermannDriveStamped."""
 
-    wants: ClassVar[tuple[str, ...]] = ("drive",)
+    needs: ClassVar[tuple[str, ...]] = ("drive",)
     columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
 
 
@@ -118,14 +118,14 @@ class AckermannTopic(Topic):
 class InertialTopic(Topic):
     """Rates and specific forces of an Imu, held until the next one: controls of a robot whose frame is the Imu's."""
 
-    wants: ClassVar[tuple[str, ...]] = ("force",)
+    needs: ClassVar[tuple[str, ...]] = ("force",)
     columns: ClassVar[tuple[str, ...]] = INERTIAL
     space: ClassVar[bool] = True
 
 
 @declared
 class Carried(Topic):
-    """What a sensor measured that the robot carries."""
+    """Measurements of a sensor on the robot."""
 
     base_frame: Annotated[
         str | None, "The robot's frame in tf, for the sensor's mount; if absent that of its odometry, or base_link."
@@ -157,9 +157,9 @@ def _a_size(value: Any) -> bool:
 
 @register("topic", "scan")
 class Scans(Carried):
-    """What a sensor saw: laser beams, points, ranges, detections, corners or poses of tags, markers."""
+    """Observations of a sensor: laser beams, points, ranges, detections, corners or poses of tags, markers."""
 
-    wants: ClassVar[tuple[str, ...]] = ("seen",)
+    needs: ClassVar[tuple[str, ...]] = ("seen",)
 
     sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
     take: Annotated[
@@ -219,7 +219,7 @@ class Scans(Carried):
 class Images(Carried):
     """Images of a camera: Image, CompressedImage; its calibration is that of the CameraInfo beside it."""
 
-    wants: ClassVar[tuple[str, ...]] = ("image",)
+    needs: ClassVar[tuple[str, ...]] = ("image",)
 
     sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
     info: Annotated[
@@ -240,7 +240,7 @@ class Sparse(Carried):
 class Imu(Sparse):
     """Readings of sensors of the robot itself by an Imu: of a gyroscope, and those that are given a name."""
 
-    wants: ClassVar[tuple[str, ...]] = ("rates",)
+    needs: ClassVar[tuple[str, ...]] = ("rates",)
 
     gyro: Annotated[str | None, "Name of the sensor, a `gyro`, of its rates; null: they are not taken."] = "gyro"
     heading: Annotated[str | None, "Name of the sensor, a `heading`, of its orientation."] = None
@@ -264,7 +264,7 @@ class Imu(Sparse):
 class Compass(Sparse):
     """Headings by a MagneticField, of a robot of the plane: `heading`, counted from magnetic east to the left."""
 
-    wants: ClassVar[tuple[str, ...]] = ("field",)
+    needs: ClassVar[tuple[str, ...]] = ("field",)
 
     sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
 
@@ -273,7 +273,7 @@ class Compass(Sparse):
 class Placed(Posed):
     """Poses, or positions on the globe, whose origin is that of metres."""
 
-    wants: ClassVar[tuple[str, ...]] = ("pose", "globe", "transforms")
+    needs: ClassVar[tuple[str, ...]] = ("pose", "globe", "transforms")
 
     origin: Annotated[
         Any, "NavSatFix: [latitude_deg, longitude_deg, height_m] of the map's origin; the first fix if absent."

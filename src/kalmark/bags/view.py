@@ -113,7 +113,7 @@ def marker_array(t_ns: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 # ------------------------------------------------------------------ a log
 def view_messages(log: Log) -> Iterator[Outgoing]:
-    """Yield what is drawn of a log, in order of time."""
+    """Yield the messages that draw a log, in order of time."""
     if not log.events:
         return
     begin = log.events[0].t_ns

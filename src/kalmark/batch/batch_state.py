@@ -47,7 +47,7 @@ class BatchState(NamedTuple):
 
     @property
     def ends(self) -> list[int]:
-        """Where the errors of each group end in a step; those of the poses come first."""
+        """Ends of the errors of each group in a step; those of the poses come first."""
         sizes = [space.dof * len(rows) for space, rows in zip(self.spaces, self.groups, strict=True)]
         return [int(end) for end in np.cumsum(sizes)]
 

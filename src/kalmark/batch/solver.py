@@ -102,7 +102,7 @@ def optimum(
 
 
 class _Search:
-    """Where the search stands: the problem there, the multipliers of the motion, the penalty (q,) on its violation."""
+    """State of the search: the problem there, the multipliers of the motion, the penalty (q,) on its violation."""
 
     def __init__(self, problem: Problem, start: BatchState) -> None:
         _refuse_hidden(problem, start)

@@ -127,13 +127,13 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> dict[str, Any]:
 
 
 def kinds(scores: Sequence[Scores]) -> list[str]:
-    """Return what has a NEES in these runs; pose, heading, landmarks and joint state always."""
+    """Return the quantities with a NEES in these runs; pose, heading, landmarks and joint state always."""
     always = ("pose", "heading", "landmarks", "joint")
     return [n for n in NEES if n in always or any(np.isfinite(s.series[n]).any() for s in scores)]
 
 
 def mount_uncertainties(scores: Sequence[Scores]) -> dict[str, float]:
-    """Return how uncertain mounts came out at the end of the runs: the worst of each run.
+    """Return the final uncertainties of mounts: the largest of each run.
 
     `mount_m`, `mount_deg`: RMS over runs; `mount_sure`: runs whose NEES is below its 99.73 % quantile, 3 sigma.
     """
@@ -208,7 +208,7 @@ class Campaign:
     """N runs of a world, each estimator on the same logs: `scores[estimator][run]`, `t_s` the time of each step.
 
     `kind` is "world", or "config" of a log's replay; `description` is it as it was in force, in YAML.  Averages of NEES
-    leave out the first `skip` steps.  `path` says what computed the runs: `running.path_of`.
+    leave out the first `skip` steps.  `path` is the way by which the runs were computed: `running.path_of`.
     """
 
     world: str
@@ -224,7 +224,7 @@ class Campaign:
     path: str = "ordinary path"
 
     def ideal(self, name: str) -> float:
-        """Return what the ANEES of a consistent filter would be: its degrees of freedom, 1 for the joint state."""
+        """Return the ANEES of a consistent filter: its degrees of freedom, 1 for the joint state."""
         return Anees(name, [score for scores in self.scores.values() for score in scores]).ideal
 
     def label(self, name: str) -> str:

@@ -2,8 +2,8 @@
 
 A run has the numbers of the ordinary path (`simulation`, `score`) up to rounding.  The random numbers are those of the
 simulator, drawn in its order, many at a time.  The filter calls the compiled prediction and correction that
-`Slam.process` calls, by their addresses.  `refusal` says why the engine does not run a world; a run that it cannot
-finish, such as one whose filter diverges, is left to the ordinary path, too.
+`Slam.process` calls, by their addresses.  `refusal` has the reasons why the engine does not run a world; a run that it
+cannot finish, such as one whose filter diverges, is left to the ordinary path, too.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def sensor_noise(sensor: RangeBearing) -> Noise:
 
 # ---------------------------------------------------------------------- what the engine runs
 def refusal(world: Any, configs: Mapping[str, Config]) -> str:
-    """Return why the engine does not run a scene with these filters; empty if it does."""
+    """Return the reasons why the engine does not run a scene with these filters; empty if it does."""
     if not isinstance(world, World):
         return "the batched engine does not replay logs"
     if world.dimensions != 2 or len(world.robots) != 1:
@@ -141,7 +141,7 @@ def drive_route(
     model: tuple[int, Array], kind: int, start: Array, dt_s: float, errors: Array, walk: Array, u: Array, places: Array,
     limits: tuple[float, float], on_robot: bool,
 ) -> tuple[Array, Array, bool]:  # fmt: skip
-    """Drive to `places` (T, 2), or by a constant control u (m,); return the states (steps + 1, 3) and what is told.
+    """Drive to `places` (T, 2), or by a constant control u (m,); return states (steps + 1, 3) and noisy controls.
 
     `errors` (steps, m) are those of the controls, `walk` (steps, 3 or 0) is the diffusion in the robot's frame; `kind`
     is the motion's number among `MOTIONS`, `limits` speed and turning radius.  The last answer is whether the places
@@ -190,7 +190,7 @@ def drive_route(
 def visible_points(
     states: Array, at: Array, points: Array, scans: Index, limits: tuple[float, float, float]
 ) -> InSight:
-    """Return what a sensor at `at` (3,) sees at the steps `scans`: steps (N,), points (N,) and their distances (N,).
+    """Return the points in view of a sensor at `at` (3,): steps (N,) of `scans`, points (N,) and distances (N,).
 
     Last is where the points are in the sensor's frame (N, 2).  `limits` are the least and the greatest range and half
     of the field of view.

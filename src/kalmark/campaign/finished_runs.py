@@ -1,6 +1,6 @@
 """`Kept`: the finished runs of a campaign in its folder, so that one that was stopped goes on where it was.
 
-``campaign.json`` says what the runs are of; ``runs/CELL/NUMBER.npz`` holds the scores of one run.  A file appears
+``campaign.json`` describes the runs; ``runs/CELL/NUMBER.npz`` holds the scores of one run.  A file appears
 complete or not at all, so a campaign may be killed at any time.
 """
 
@@ -69,7 +69,7 @@ class Kept:
         if other:
             raise KalmarkError(
                 f"{folder}: got runs of another campaign ({', '.join(other)} differs), expected another --out, "
-                "or --no-resume to begin anew"
+                "or --no-resume to begin again"
             )
         folder.mkdir(parents=True, exist_ok=True)
         write(file, json.dumps(head | {"cells": old["cells"] | cells}, indent=2) + "\n")

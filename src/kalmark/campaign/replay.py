@@ -1,4 +1,4 @@
-"""`Replay`: a parametric bootstrap of a log.  The same route, the same sightings, all noise drawn anew from the models.
+"""`Replay`: a parametric bootstrap of a log: the same route and sightings, all noise drawn again from the models.
 
 The log goes through its filter twice: once as it is, for the map and the association; then on that map, known, so that
 the path fits the map at every time and does not jump where a loop closes.  That map is the truth now.  A robot follows
@@ -91,14 +91,14 @@ class Look(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """What there is to replay, in the order of the log, and the landmarks: (2,) m, or (3,) with a signature."""
+    """Events to replay, in the order of the log, and the landmarks: (2,) m, or (3,) with a signature."""
 
     events: list[Steer | Look | Fix]
     landmarks: dict[Id, Array]
 
 
 def record_for_replay(config: Config, log: Log, progress: bool = True) -> Recorded:
-    """Return what a log holds for a replay.  Raises KalmarkError where the filter gives up, or nothing was seen."""
+    """Return the events of a log for a replay.  Raises KalmarkError where the filter gives up, or nothing was seen."""
     slam = build_slam(config, log)
     bar = track(log.events, f"{log.name}, the map", len(log.events), show=progress)
     reports = [report for event in bar if (report := _processed(slam, event, config)) is not None]
@@ -258,7 +258,7 @@ def refuse_unsupported(config: Config, name: str, robot: Robot) -> None:
 
 @dataclass
 class _Driven:
-    """A robot on its way: its true state, the control it holds, the one it was told, and what it carries."""
+    """A robot on its way: its true state, its held control, the control given to the filter, and its sensors."""
 
     motion: Any
     state: Array
@@ -274,7 +274,7 @@ class _Driven:
             self.move(part, rng)
 
     def move(self, part: MotionPart, rng: Generator) -> None:
-        """Move by a part of a control; what it diffuses is that of the control that the filter knows."""
+        """Move by a part of a control, with the diffusion of the control that the filter has."""
         self.state, *_ = self.motion.move(self.state, part.u, part.dt_s)
         self.state = add_diffusion(self.motion, self.state, self.told, part.dt_s, rng)
 
@@ -296,7 +296,7 @@ class _Replaying:
         self.origins: dict[Key, tuple[Id | None, ...]] = {}
 
     def simulation(self) -> Simulation:
-        """Return the log of all events, and what it does not tell: states as they are after each scan."""
+        """Return the log of all events, and the true states after each scan."""
         start = {name: robot.state for name, robot in self.robots.items()}
         after: dict[int, dict[str, Array]] = {}
         for event in self.replay.recorded.events:
@@ -319,7 +319,7 @@ class _Replaying:
         return Simulation(log, states, mounts, self.origins)
 
     def _steer(self, steer: Steer) -> None:
-        """Take the control that leads back to the path, and tell it with noise."""
+        """Take the control that leads back to the path, and give it to the filter with noise."""
         event, robot, rng = steer.event, self.robots[steer.event.robot], self.chance.control
         robot.advance(event.t_ns, rng, last=True)
         N = control_covariance(robot.motion, event)

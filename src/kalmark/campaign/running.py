@@ -50,7 +50,7 @@ ESTIMATORS = ("invariant", "ekf", "fej")
 
 @dataclass(frozen=True)
 class Plan:
-    """What every run of a cell does; sent to the workers.  `path` is how: `path_of`."""
+    """Task of every run of a cell; sent to the workers.  `path` is the way of `path_of`."""
 
     world: Scene
     configs: dict[str, Config]
@@ -72,7 +72,7 @@ class Plan:
         return next(self.some((number,)))
 
     def some(self, numbers: Sequence[int]) -> Iterator[Result]:
-        """Yield what `run` returns for each of some numbers; a run that the engine leaves takes the ordinary path."""
+        """Yield the results of `run` for some numbers; a run that the engine leaves takes the ordinary path."""
         with threadpool_limits(1):
             engine = self.engine()
             for number in numbers:
@@ -92,7 +92,7 @@ class Plan:
 
 
 def path_of(plan: Plan, runs: int) -> str:
-    """Return how so many runs of a plan are done: `BATCHED`, or the ordinary path and why.
+    """Return the way of so many runs of a plan: `BATCHED`, or the ordinary path and the reason.
 
     That depends on nothing but the world, its filters and the number of runs: so do the last digits of the numbers.
     """
@@ -324,7 +324,7 @@ def _in_parallel(plans: Sequence[Plan], groups: Sequence[Group], jobs: int) -> I
 
 
 def worker_died(error: BaseException | None) -> bool:
-    """Return whether an exception, or its cause, says that a worker died: one of loky, dask or ray."""
+    """Return whether an exception, or its cause, is the death of a worker of loky, dask or ray."""
     while error is not None:
         if {cls.__name__ for cls in type(error).__mro__} & DEATHS:
             return True

@@ -167,12 +167,12 @@ def _judge_line(
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How one estimator did on one log.
+    """Scores of one estimator on one log.
 
     `series` has an array (robots, steps) for each of `SERIES`: NEES of the pose (3, in space 6), the heading or
     orientation (1, 3), the whole state if it has more than a pose, landmarks (the mean over the map), joint state,
     and the robot's uncertain mounts (the mean), each with its degrees of freedom `..._dof`; NaN where there is
-    nothing to say.
+    no score.
     """
 
     series: dict[str, Array]
@@ -206,7 +206,7 @@ def score(slam: Slam, simulated: Simulation, steps: Sequence[int], map_every: in
 
 
 class _Scorer:
-    """Gathers what the filter says step by step; poses are scored together at the end."""
+    """Record of the filter's estimates step by step; poses are scored together at the end."""
 
     def __init__(self, slam: Slam, simulated: Simulation, steps: Sequence[int], map_every: int) -> None:
         self.slam, self.simulated, self.map_every = slam, simulated, map_every

@@ -215,7 +215,7 @@ class Sweep:
 
     @property
     def _short(self) -> bool:
-        """Whether the last words of the keys tell them apart."""
+        """True if the last words of the keys differ."""
         return len({key.rpartition(".")[2] for key in self.keys}) == len(self.keys)
 
 

@@ -26,7 +26,7 @@ SHOWN = ("diverged", "joint_anees", "pose_anees", "position_rmse_m", "heading_rm
 
 
 class Backend(StrEnum):
-    """Who runs the processes."""
+    """Program that runs the processes."""
 
     LOKY = "loky"
     DASK = "dask"
@@ -52,13 +52,13 @@ def campaign(
         typer.Option(metavar="KEY.PATH=A,B", help="Run with each of the values; of several keys, all combinations."),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume/--no-resume", help="Keep the finished runs of this campaign, or run all anew.")
+        bool, typer.Option("--resume/--no-resume", help="Keep the finished runs of this campaign, or run all again.")
     ] = True,
     skip: Annotated[int, typer.Option(min=0, help="Steps at the beginning that no average of NEES counts.")] = 0,
     out: Annotated[Path | None, typer.Option(help="The folder to write. (default: out/campaign-NAME)")] = None,
     overrides: Overrides = None,
 ) -> None:
-    """Run a world many times, or a log with all noise drawn anew: ANEES and its band, RMSE, divergences.
+    """Run a world many times, or a log with all noise drawn again: ANEES and its band, RMSE, divergences.
 
     A log's route, map and sightings are those that its configured filter finds; all else is simulated by its models.
     """

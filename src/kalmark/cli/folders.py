@@ -118,7 +118,7 @@ def explain(
     robot: Annotated[str | None, typer.Option(help="Of this robot. (default: the nearest scan of any)")] = None,
     trust: Trust = False,
 ) -> None:
-    """Say why one scan's observations became what they did, and draw it: what each was compared with, d2, gates."""
+    """Print and draw the association of one scan: candidates of each observation, d2, gates, outcome and reason."""
     from kalmark.results.explain import explain as explanation_of
     from kalmark.results.plot import save_figure
     from kalmark.results.plot_scan import draw_scan

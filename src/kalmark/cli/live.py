@@ -26,7 +26,7 @@ BUSY = 0.05  # of the time may be spent on saving
 
 
 class SignalledError(Exception):
-    """The program was told to end by a signal."""
+    """A signal asks the program to end."""
 
 
 class Signals:
@@ -74,7 +74,7 @@ class Checkpoints:
         self.due, self.saved, self.failed = time.monotonic() + every_s, slam.state.t_ns, False
 
     def look(self) -> None:
-        """Save the map if it is time; that it cannot be saved is said once, and the conversation goes on."""
+        """Save the map if it is time; a failure is printed once, and the conversation goes on."""
         if self.out is None or not self.every_s or time.monotonic() < self.due or self.saved == self.slam.state.t_ns:
             return
         begin = time.monotonic()
@@ -172,7 +172,7 @@ def serve(
 ) -> None:
     """Answer one program after the other on a port of this machine, until the filter is lost.
 
-    One that is silent for `silent_s` (0: for ever), reads no answers for as long, or speaks another protocol is left.
+    A connection is closed if it sends nothing for `silent_s` (0: no limit), reads no answers, or uses another protocol.
     `look` is called after each answer, and whenever there was none for `idle_s`.
     """
     from kalmark.results.live import Incoming, converse

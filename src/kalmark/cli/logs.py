@@ -114,7 +114,7 @@ def worlds(
 
 
 def _list(shipped: dict[str, Path]) -> None:
-    """Print the names of files and what their first comment says they are."""
+    """Print the names of files and their first comments."""
     print_table("", ("name", "what"), [(name, _headline(path)) for name, path in shipped.items()], align="<<")
 
 

@@ -22,7 +22,7 @@ VERDICT_OBSERVATIONS = 3_000  # that the verdict at the end of a run takes
 
 
 class OnError(StrEnum):
-    """What to do with bad input."""
+    """Treatment of bad input."""
 
     RAISE = "raise"
     SKIP = "skip"

@@ -56,7 +56,7 @@ def slam_of(config: str, overrides: Sequence[str]) -> Slam:
 
 
 def announce_compilation_elsewhere() -> None:
-    """Say on stderr that other processes will compile the inner loops, as far as can be known: nothing is there yet."""
+    """Print on stderr that other processes will compile the inner loops, if the cache of compiled code is empty."""
     from kalmark.compiled import SOURCES, cache_folder, say_compiling
 
     if not all(Path(cache_folder(part)).exists() for part in SOURCES):

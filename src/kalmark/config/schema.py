@@ -96,7 +96,7 @@ class SpacePose(_Place):
 
 
 class MountConfig(PlanePose):
-    """Where a sensor sits, in the robot's frame.  If either sigma is above 0, the mount is calibrated as below."""
+    """Pose of a sensor in the robot's frame.  If either sigma is above 0, the mount is calibrated as below."""
 
     elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_SPACE[1:], _SPACE_FOR_PLANE)
 
@@ -105,7 +105,7 @@ class MountConfig(PlanePose):
 
 
 class SpaceMountConfig(SpacePose):
-    """Where a sensor sits, in the robot's frame; turned by roll, then pitch, then yaw about the robot's axes.
+    """Pose of a sensor in the robot's frame; turned by roll, then pitch, then yaw about the robot's axes.
 
     The optical axis of a camera is its z axis, x to the right in its image and y down: one pointing ahead has roll -90
     and yaw -90 deg.  If either sigma is above 0 the mount is in the map, and the filter calibrates it.
@@ -113,7 +113,7 @@ class SpaceMountConfig(SpacePose):
 
 
 class StartConfig(PlanePose):
-    """Where a robot of the plane starts, and how surely."""
+    """Start of a robot of the plane, and its sigmas."""
 
     elsewhere: ClassVar[dict[str, str]] = dict.fromkeys((*POSE_OF_SPACE, *STATES["space"][2:]), _SPACE_FOR_PLANE)
 
@@ -136,7 +136,7 @@ class StartConfig(PlanePose):
 
 
 class SpaceStartConfig(SpacePose):
-    """Where a robot of space starts, and how surely; turned by roll, then pitch, then yaw about the world's axes."""
+    """Start of a robot of space, and its sigmas; turned by roll, then pitch, then yaw about the world's axes."""
 
     at_rest: bool = False
     """inertial: roll, pitch (or the gravity) and the bias of the rate are found from the log, which begins at rest."""
@@ -287,7 +287,7 @@ BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]
 
 
 class LogConfig(Section):
-    """Which log, and how much of it; and the options of its format, see below."""
+    """Log, robots and time to read, and the options of its format, see below."""
 
     model_config = ConfigDict(extra="allow")
 

@@ -51,7 +51,7 @@ Positive = Annotated[float, Field(gt=0, le=FAR, allow_inf_nan=False)]
 class Section(BaseModel):
     """A frozen mapping of keys, each with its default; unknown keys and loosely typed values are refused.
 
-    `elsewhere` says of keys that another section of this kind has what they are here.
+    `elsewhere` explains the keys that another section of this kind has.
     """
 
     # what a command does not read is not built: a third of the time to import the configuration

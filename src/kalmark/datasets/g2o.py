@@ -70,7 +70,7 @@ TAGS = (*POSES, *PLACES, *EDGES, *SIGHTS, OFFSET, *IGNORED)
 
 @dataclass
 class Graph:
-    """What the lines of a file have: poses, places and edges, by ids."""
+    """Content of a file: poses, places and edges, by ids."""
 
     poses: dict[int, Array] = field(default_factory=dict)
     places: dict[Id, Array] = field(default_factory=dict)

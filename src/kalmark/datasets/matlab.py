@@ -75,7 +75,7 @@ def elements(path: Path, most: int) -> Iterator[tuple[str, bytes]]:
 
 
 class Head(NamedTuple):
-    """What an array says of itself, and where its numbers are."""
+    """Header of an array, and the place of its numbers."""
 
     name: str
     shape: tuple[int, ...]

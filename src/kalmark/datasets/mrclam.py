@@ -57,7 +57,7 @@ def read(
     shift_ns = round(bearing_shift_s * 1e9)
     subjects = read_barcodes(path / "Barcodes.dat", request)
     ignored = () if robot_sightings else MRCLAM_ROBOTS
-    robots = tuple(robot for robot in present if request.wants(robot))
+    robots = tuple(robot for robot in present if request.includes(robot))
     events: list[Event] = []
     truth = {}
     for robot in robots:

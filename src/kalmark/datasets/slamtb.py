@@ -180,7 +180,7 @@ def configuration(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
 
 
 def landmark_type(init: dict[str, Any]) -> dict[str, Any]:
-    """Return the landmark type of a recording, with the prior of what one image does not tell."""
+    """Return the landmark type of a recording, with the prior of the numbers that one image does not determine."""
     kind = init["initType"]
     prior = init["plkLin" if kind in PLUECKER else "idpPnt"]
     mean, sigma = as_vector(prior["nonObsMean"]), as_vector(prior["nonObsStd"])
@@ -212,7 +212,7 @@ def motion(kind: str, noise: Array) -> dict[str, Any]:
 
 
 def start_section(settings: dict[str, Any], state: Array) -> dict[str, Any]:
-    """Return where a robot starts; standard deviations of roll, pitch and yaw are taken about x, y and z."""
+    """Return the start of a robot; standard deviations of roll, pitch and yaw are taken about x, y and z."""
     section: dict[str, Any] = describe_pose(state[WXYZ_TO_XYZW]) | {
         "sigma_position_m": as_vector(settings["positionStd"]),
         "sigma_rotation_deg": as_vector(settings["orientationStd"]),

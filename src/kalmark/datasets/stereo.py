@@ -51,7 +51,7 @@ def log_of_features(
     format: str, path: Path, request: Request, robot: str, t_ns: Any, u: Array, y: Array, seen: Any, section: Any,
     first: int = 0, **rest: Any
 ) -> Log:  # fmt: skip
-    """Return the log of features y (4, M, N), of which those `seen` (M, N) are told by their number from `first`."""
+    """Return the log of features y (4, M, N), observed where `seen` (M, N); their ids count from `first`."""
     each = ((y[:, ids, k].T, (ids + first).tolist()) for k, ids in enumerate(map(np.flatnonzero, seen.T)))
     rig = {"robots": {robot: section}, "landmarks": {"type": "point"}}
     events = events_of(robot, SENSOR, t_ns, u, each)

@@ -21,7 +21,7 @@ RAW = ("range_m", "bearing_rad", "intensity")
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """What was found in one scan: K measurements `y` (K, m) named by `columns`, with covariances `cov` (K, p, p).
+    """Detections in one scan: K measurements `y` (K, m) named by `columns`, with covariances `cov` (K, p, p).
 
     p is m, but 2 for walls, whose ends have no error that counts.  `beams` (K, 2) are the first and the last beam of
     each, `attributes` what else is known of them, K of each.

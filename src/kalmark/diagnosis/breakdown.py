@@ -98,7 +98,7 @@ def _bins(of: str, unit: str, values: Array, rows: Ints) -> Iterator[tuple[str, 
 
 
 def _speeds(history: History) -> Array:
-    """Return how fast each robot was at its scans (S,), m/s."""
+    """Return the speed of each robot at its scans (S,), m/s."""
     out = np.zeros(len(history.t_ns))
     for name in history.robots:
         mine = np.flatnonzero(history.robot == name)

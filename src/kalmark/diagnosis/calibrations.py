@@ -32,7 +32,7 @@ MOVED_M = 1e-5  # of a mount, for its derivative
 def calibrations(
     run: Run, linear: Linear, given: BatchInput, keys: Keys, sure: set[Path_]
 ) -> tuple[list[Finding], dict[Path_, str]]:
-    """Return the calibrations that are off, and of those that the log cannot tell from another error, from which.
+    """Return the calibrations that are off; the ones that the log cannot distinguish from another error name that.
 
     All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
     Those that it determines are estimated again without scales and places of mounts, which are not linear.
@@ -68,7 +68,7 @@ def calibrations(
 
 
 def _mounts(linear: Linear, given: BatchInput) -> Iterator[Column]:
-    """Yield what a sensor that sits elsewhere adds to the data, by each coordinate of its place, in 1/m."""
+    """Yield the change of the data by each coordinate of a sensor's position, in 1/m."""
     none, d = np.zeros(len(linear.at.w)), linear.state.d
     for f, factor in enumerate(linear.problem.factors):
         robot, sensor = factor.sensor
@@ -91,7 +91,7 @@ def _mounts(linear: Linear, given: BatchInput) -> Iterator[Column]:
 def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list[tuple[float, float]]]:
     """Return the systematic errors s (K,), all estimated at once, and their sigmas (K,); and each as if alone.
 
-    The sigmas are by stretches of the run where these vary more than the noise says (`causes.systematic`).
+    The sigmas are by stretches of the run where these vary more than the noise (`causes.systematic`).
     """
     Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
     have, left = linear.residuals, linear.left(Z, W)

@@ -35,7 +35,7 @@ MANY = 0.3  # of the outliers, beyond chance, are of another landmark: it pulls 
 
 
 def strongest_findings(sure: list[Finding]) -> list[Finding]:
-    """Return what explains most, and what explains as much after it.
+    """Return the finding of the largest gain, and those that gain as much after it.
 
     Surveys that are off go before outliers and noise that would take them up, which are one for all of them, landmarks
     that move before outliers, and noise of several columns before outliers that explain clearly less: these would be
@@ -67,7 +67,7 @@ def strongest_findings(sure: list[Finding]) -> list[Finding]:
 
 
 def _joined(same: list[Finding]) -> Finding:
-    """Return what was found of one cause in several rounds as one."""
+    """Return the findings of one cause in several rounds as one."""
     first, last = same[0], same[-1]
     value = math.prod(f.value for f in same) if last.unit == causes.TIMES else sum(f.value for f in same)
     return replace(first, value=value, sigma=last.sigma, gain=sum(f.gain for f in same))
@@ -185,8 +185,8 @@ class Search:
     def _beside(self, finding: Finding) -> Finding:
         """Return a systematic error as it is beside the others of its column, and take these out of the data.
 
-        One that is no cause by itself may still do the opposite: of a speed that is .94 v + .02 m/s the offset alone
-        would move the map.  Those that the data cannot tell from it, alone or with others, are left.
+        One that is no cause alone may still do the opposite: of a speed that is .94 v + .02 m/s the offset alone
+        would move the map.  Those that the data cannot distinguish from it, alone or with others, are left.
         """
         every = columns_of(self.linear, self.sensors, self.rates)
         mine = next((c for c in every if (c.name, c.of) == (finding.name, finding.of)), None)

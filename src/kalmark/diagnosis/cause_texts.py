@@ -47,7 +47,7 @@ LIMITS = {
 
 
 def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
-    """Return what was found, in a sentence, and the line that would cure it, "" if no key does.
+    """Return a sentence about a finding, and the line that would cure it, "" if no key does.
 
     `config` is the configuration of the run: a new noise is given as a number where it states the old one.
     """
@@ -243,7 +243,7 @@ def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 
 def _jump(finding: Finding) -> str:
-    """Return how far a jump goes, and how sure that is."""
+    """Return the size of a jump with its sigma, as a text."""
     far_m, turn_deg = step_size(np.zeros(3) if finding.at is None else finding.at)
     return f"{figure(far_m)} m and {figure(turn_deg)} deg ({figure(finding.value, 2)} sigma)"
 
@@ -266,7 +266,7 @@ def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 
 def odd_control_text(finding: Finding, odd: OddControl) -> Words:
-    """Return what a control says that jumps itself, and the limit that leaves it out, where its column has one."""
+    """Return a sentence about a control that jumps, and the limit that leaves it out, where its column has one."""
     robot = finding.of[0]
     degrees = odd.column.endswith(("_rad", "_radps"))
     value = f"{figure(math.degrees(odd.value) if degrees else odd.value)} {'deg' if degrees else ''}".rstrip()

@@ -19,14 +19,14 @@ from kalmark.batch.motion_chain import START, UNKNOWN
 from kalmark.diagnosis.error_columns import Column, Where
 from kalmark.diagnosis.linear import OUT, Left, Linear
 
-BLOCKS = 40  # stretches of a run, whose scores tell how much a sum of them varies
+BLOCKS = 40  # stretches of a run; the variance of their scores is that of a sum of them
 LEAST_INFORMATION = 1e-9
 SPREADS = (5.0, 20.0, 100.0)  # how many times as wide as the noise outliers may be
 MOST_OUTLIERS = 0.2  # of all observations: more are noise
 FIRST_SHARE, MIXTURE_ROUNDS = 0.01, 30
 FAR = 4.0  # sigmas of an outlier
 SETS = 40  # of simulated data
-SEEN = 8  # times a landmark that can be judged by itself
+SEEN = 8  # observations of a landmark that can be judged alone
 LOOKED_AT = 20  # landmarks
 MOST_CONDITION = 1e12
 SHOWS = 3.0  # sigmas of a measurement, that a moving landmark is off by in the end
@@ -43,7 +43,7 @@ JUMPS = ("odometry_jump", "kidnapped")
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """A cause that explains the data better by `gain`.  `of` says what it is of.
+    """A cause that explains the data better by `gain`.  `of` names its robot, sensor or landmark.
 
     That is robot, sensor and column, or robot, column and kind of error of its controls, or a landmark, or a robot.
     `value` and `sigma` are its size in `unit`.  `cure` is what takes it out of the data: the systematic error itself as
@@ -71,14 +71,14 @@ class Finding:
 
     @property
     def overstated(self) -> bool:
-        """Whether it is a noise that is smaller than stated."""
+        """True if it is a noise that is smaller than stated."""
         return self.unit == TIMES and self.value < 1.0
 
 
 def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
     """Return the systematic errors, each as if it were the only one.  Rao's score test.
 
-    Its statistic is divided by how much the scores of stretches vary, where that is more than the model says: errors
+    Its statistic is divided by the variance of the scores of stretches, where that is above the model's: errors
     that last from scan to scan, or a noise that is not the configured one, would else look like a systematic error.
     """
     if not columns:
@@ -148,7 +148,7 @@ def _blocks(linear: Linear) -> tuple[Ints, Ints]:
 
 # ------------------------------------------------------------------ noise
 def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ...]]) -> list[Finding]:
-    """Return how much larger the noise of each measured column, and component of the controls, is than stated.
+    """Return the ratio of actual to stated noise of each measured column and component of the controls.
 
     Variance components: the sum of squares of what is left of a group, over what it is in data as configured.
     """
@@ -177,7 +177,7 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
 
 
 def _measured(names: tuple[str, ...], p: int, column: Ints) -> Iterator[tuple[str, Flags]]:
-    """Yield what a sensor of p residuals measures, by name, and which rows with the numbers `column` (N,) are of it.
+    """Yield the quantities of a sensor of p residuals by name, and their rows among the numbers `column` (N,).
 
     The corners of a tag have one noise, and its size, a column too, has none.
     """
@@ -214,7 +214,7 @@ def correlations(
 ) -> list[Finding]:
     """Return by how much what is left of successive sightings of one landmark is correlated, by sensor and column.
 
-    `t_s` (n,) are the times of the poses.  The noise of a finding is the white one that says as little.
+    `t_s` (n,) are the times of the poses.  The noise of a finding is the white noise of the same information.
     """
     rows, found = linear.rows, []
     apart = t_s[rows.node[rows.two]] - t_s[rows.node[rows.one]]
@@ -371,7 +371,7 @@ def _free_steps(linear: Linear, nodes: list[int]) -> Iterator[tuple[float, Array
 
 
 def priors(linear: Linear, t_s: Array) -> list[Finding]:
-    """Return the surveyed landmarks that are elsewhere than the survey says, each as if it were the only one.
+    """Return the surveyed landmarks that are elsewhere than their survey, each as if it were the only one.
 
     Their sightings determine where they are.  Only those are looked at whose surveys seem to be off most.
     """

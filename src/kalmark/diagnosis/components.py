@@ -3,7 +3,7 @@
 The data of the batch problem, linear about its optimum, have the covariance V, the sum over the noises k of exp(t_k)
 V_k.  With y'P V_k P y = q_k of what the state leaves of the data, the score of t_k is (q_k - E q_k) / 2 and the Fisher
 information is the covariance of q_k / 2: both from simulated data.  The likelihood is that of the data without the
-state (REML), which is the likelihood of the innovations of a filter that knows nothing of its landmarks beforehand.
+state (REML), which is the likelihood of the innovations of a filter without prior landmarks.
 Patterson and Thompson 1971, Biometrika 58; Schweppe 1965, IEEE Transactions on Information Theory 11.
 """
 
@@ -29,7 +29,7 @@ from kalmark.slam.robot import Robot
 SETS = 60  # of simulated data
 STEPS, SMALL = 12, 0.01  # of Fisher's scoring, and of the logarithm of a sigma: as good as none
 LONGEST = math.log(3.0)  # step of the logarithm of a variance
-LEAST, MOST = 0.1, 30.0  # times a stated sigma: beyond, the data only say that it is smaller, or larger
+LEAST, MOST = 0.1, 30.0  # times a stated sigma: beyond, the data only bound it
 KNOWN = 0.35  # largest sigma of the logarithm of a sigma that the data determine
 ALMOST, ROUNDING = 0.9, 1e-6  # what makes parts of covariances the same
 FAINT = 0.1  # information on a t that is as good as none
@@ -60,7 +60,7 @@ class Noise:
 class Estimate(NamedTuple):
     """A noise by maximum likelihood: its value, the sigma of its logarithm, and whether the data determine it.
 
-    At the `bound` are those of which the data only say that they are smaller, or larger.
+    At the `bound` are those that the data only bound from one side.
     """
 
     value: float
@@ -70,7 +70,7 @@ class Estimate(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What a noise adds to the covariances: R (K, p, p) of each factor, Q (q n, q n) of the motion.
+    """Part of a noise in the covariances: R (K, p, p) of each factor, Q (q n, q n) of the motion.
 
     `columns` (r,) are those of the root of the motion's covariance that it scales, None if it does more than that.
     """

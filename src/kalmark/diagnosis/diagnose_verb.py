@@ -18,7 +18,7 @@ def diagnose(
     ] = 20_000,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as JSON.")] = False,
 ) -> None:
-    """Say whether the map of a run can be trusted, and if not, why and what would cure it: without any truth."""
+    """Judge without truth whether the map of a run is right; if not, name causes and cures."""
     from kalmark.diagnosis.breakdown import breakdown, nees_parts
     from kalmark.diagnosis.picture import draw_diagnosis
     from kalmark.diagnosis.verdict import diagnose as diagnosed

@@ -71,7 +71,7 @@ def find_split_landmarks(run: Run) -> list[Pair]:
 
 
 class Revisits(NamedTuple):
-    """How often landmarks came into view again as before, of these how often unseen, and since when, s of the log.
+    """Counts of landmarks that came into view again, of those not observed then, and their first time, s of the log.
 
     `score` is the logarithm of how seldom chance misses so many.
     """
@@ -83,7 +83,7 @@ class Revisits(NamedTuple):
 
 
 def unseen_counts(run: Run) -> Revisits | None:
-    """Return how often landmarks were not seen where they were seen before; None if that is seldom, or by chance.
+    """Return counts of landmarks that were not observed where they were before; None if that is rare, or by chance.
 
     A thing that stands is seen again from where it was seen, within a share `SAME` of its distance: nothing new hides
     it there.  It is missed by chance in (1 - p)^n of the visits of n scans, p the share of scans in which it is seen on
@@ -144,7 +144,7 @@ def _places(run: Run) -> dict[str, Array]:
 
 
 def _sightings(run: Run) -> dict[str, Ints]:
-    """Return the scans (k,) of two landmarks or more in which each landmark was seen that ids do not tell."""
+    """Return the scans (k,) of two landmarks or more in which each landmark without an id was observed."""
     h = run.history
     used = (h.outcome == "associated") & (h.id == "")
     used &= np.bincount(h.step[used], minlength=len(h.t_ns))[h.step] > 1
@@ -171,7 +171,7 @@ def _in_turn(a: Ints, b: Ints) -> int:
 
 
 def vanished_landmarks(run: Run) -> list[Moment]:
-    """Return when of the landmarks that a robot saw until then none is seen any more, which no ids say.
+    """Return the time after which a robot observes none of its earlier landmarks any more, without ids.
 
     Those of the last scans are compared with those of the next ones.  Of such landmarks a share p is seen again, so by
     chance (1 - p)^n of n vanish together.

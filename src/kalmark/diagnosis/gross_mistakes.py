@@ -42,7 +42,7 @@ FEW_SKIPPED = 0.02  # of the events may be refused in a log that fits
 MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
 FITS = 2.0  # below which a log fits
 MUCH = 3.0  # times better is the log without the mistake
-ALIKE = 0.95  # of what the likeliest mistake explains: the log does not tell them apart
+ALIKE = 0.95  # of the gain of the likeliest mistake: the log does not distinguish them
 BETTER = 1.5  # times better it fits without the mistake
 FEWER = 2.0  # times fewer observations without an id fit nothing: the others are clutter
 LOST = 9.0  # what an observation without an id counts that is of no landmark in the map: as one at the gate
@@ -58,7 +58,7 @@ MOVED = "moving_landmark"  # also one that was moved once
 
 
 class Fit(NamedTuple):
-    """How observations (O,) fit: d2 per degree of freedom, at most `MOST`, and the degrees of freedom of each."""
+    """Fit of observations (O,): d2 per degree of freedom, at most `MOST`, and the degrees of freedom of each."""
 
     values: Array
     dof: Array
@@ -79,7 +79,7 @@ class Fit(NamedTuple):
         return float(np.mean(self.values < LOST)) if len(self.values) else 0.0
 
     def fits(self, most: float, before: Fit) -> bool:
-        """Whether its mean is below `most`, or that of all that fits anything, which is far more than it was before."""
+        """Return whether the mean is below `most`, or that of all with a landmark, which are far more than before."""
         lost, were = self.values == LOST, before.values == LOST
         some = FEWER * lost.sum() * len(were) < were.sum() * len(lost)
         return self.mean < most or bool(some and self.values[~lost].mean() < most)
@@ -93,7 +93,7 @@ REFUSED = Fit(np.zeros(0), np.zeros(0))
 
 
 def fit_of_run(run: Run) -> Fit:
-    """Return how the observations of a run fit: what fits nothing counts `MOST`.
+    """Return the fit of the observations of a run: one without a landmark counts `MOST`.
 
     What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
     time, and clutter fits none either.  What is deferred after a gap, until the robot is known again, contradicts
@@ -162,7 +162,7 @@ def likeliest(
 
 
 def fits_better(after: Fit, before: Fit) -> bool:
-    """Whether a log fits without a mistake, and far better than with it."""
+    """Return whether a log fits without a mistake, and far better than with it."""
     return after.fits(FITS, before) and BETTER * after.mean < before.mean
 
 
@@ -209,7 +209,7 @@ def find_delay(
 def shrinkage(mistake: Mistake, events: list[Event]) -> float:
     """Return the logarithm of by how much all measurements of events are smaller without a mistake.
 
-    The density of y is that of f y times f: what is made so small that it lies within the noise fits, but says little.
+    The density of y is that of f y times f: values scaled to below the noise fit, but have little information.
     It counts for the share that fits as it is; what fits nothing counts a constant instead of its density.
     """
     return sum(len(e.y) * mistake.shrunk.get((e.robot, e.sensor), 0.0) for e in events if isinstance(e, Scan))
@@ -218,7 +218,7 @@ def shrinkage(mistake: Mistake, events: list[Event]) -> float:
 def find_later_mistake(run: Run, log: Log, first: int) -> Mistake | None:
     """Return the mistake from the observation `first` on: a sensor that was turned, a source that was exchanged.
 
-    The log is filtered anew from there, from where the robots are.
+    The log is filtered again from there, from the robots' poses.
     """
     t_ns, _, rest = _from(run, log, first)
     config = run.config
@@ -251,7 +251,7 @@ def misfits_from(now: Fit) -> int | None:
 def find_wrong_starts(run: Run, log: Log) -> Mistake | None:
     """Return that robots start elsewhere, or turned, if most of their fixes were rejected and then fit.
 
-    The path of each robot without fixes and the others, moved about the vertical axis onto its fixes, says from where.
+    The path of each robot without fixes and the others, moved about the vertical axis onto its fixes, has the start.
     """
     events, config, told, begin_s = first_events(run, log), run.config, [], math.inf
     lost = [start for start in run.history.starts if _used(run, start.robot) <= 1.0 - REJECTED]
@@ -351,7 +351,7 @@ def _at(stated: Mapping[str, float]) -> str:
 
 
 def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:
-    """Return how the first fixes of a run fit."""
+    """Return the fit of the first fixes of a run."""
     fixes = run.history.fixes[:number]
     d2 = [float(f.z @ np.linalg.solve(f.Z, f.z)) / len(f.z) for f in fixes]
     return Fit(np.minimum(d2, MOST), np.array([len(f.z) for f in fixes]))
@@ -412,7 +412,7 @@ def _rows_of(e: Scan, rows: list[int]) -> Scan:
 def find_exchanged_ids(run: Run, log: Log, now: Fit) -> Mistake | None:
     """Return that ids mean other landmarks from some time on: those whose sightings do not fit any more.
 
-    The log is filtered anew from there.  Most landmarks are where they were, after a rigid alignment, but some where
+    The log is filtered again from there.  Most landmarks are where they were, after a rigid alignment, but some where
     another one was.
     """
     first = _misfit_in_a_row(run, now)
@@ -511,14 +511,14 @@ def first_events(run: Run, events: Log | list[Event], most: int = SCANS) -> list
 
 
 def fit_without(mistake: Mistake, log: Log, events: list[Event]) -> Fit:
-    """Return how events fit without a mistake."""
+    """Return the fit of events without a mistake."""
     return fit_of_events(
         mistake.config, log, sorted(map(mistake.change, events), key=sort_key) if mistake.change else events
     )
 
 
 def fit_of_events(config: Mapping[str, Any], log: Log, events: list[Event]) -> Fit:
-    """Return how events fit under a configuration."""
+    """Return the fit of events under a configuration."""
     run = filter_events(config, log, events)
     return REFUSED if run is None else fit_of_run(run)
 

@@ -77,6 +77,6 @@ def merge_jumps(found: Sequence[Finding], begin_s: float) -> list[Finding]:
 
 
 def step_size(step: Array) -> tuple[float, float]:
-    """Return how far a step (3,) or (6,) goes, m, and turns, deg."""
+    """Return the length, m, and the turn, deg, of a step (3,) or (6,)."""
     d = 2 if len(step) == 3 else 3
     return float(np.linalg.norm(step[:d])), math.degrees(float(np.linalg.norm(step[d:])))

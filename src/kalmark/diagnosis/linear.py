@@ -28,7 +28,7 @@ OUT = 1e3  # times its noise: what is so uncertain does not count
 
 
 class Rows(NamedTuple):
-    """What each whitened residual (N,) is of: factor and row there, column, landmark (-1: none) and node.
+    """Origin of each whitened residual (N,): factor and row there, column, landmark (-1: none) and node.
 
     `one` and `two` (P,) are the rows of successive sightings of one landmark, by one sensor and column.
     """
@@ -43,7 +43,7 @@ class Rows(NamedTuple):
 
 
 class Left(NamedTuple):
-    """What the state leaves of data, a column a set: r (N, ...) of the sensors, m (q n, ...) of the motion."""
+    """Residuals of data, a column a set: r (N, ...) of the sensors, m (q n, ...) of the motion."""
 
     r: Array
     m: Array
@@ -75,7 +75,7 @@ class Linear:
 
     @property
     def state(self) -> BatchState:
-        """Where it is linear."""
+        """State of the linearisation."""
         return self.base.state
 
     def scaled(self, noise: Array | None, errors: Array | None) -> Linear:
@@ -105,7 +105,7 @@ class Linear:
 
     @cached_property
     def rows(self) -> Rows:
-        """What each residual is of."""
+        """Origin of each residual."""
         parts: list[tuple[Ints, ...]] = []
         for f, factor in enumerate(self.problem.factors):
             k, p, _ = factor.R.shape
@@ -131,7 +131,7 @@ class Linear:
 
     @property
     def surveys(self) -> Flags:
-        """Which residuals (N,) are of surveyed landmarks, not of sightings."""
+        """Flags (N,) of the residuals of surveyed landmarks."""
         of = [f.sensor[1] == "" and f.term.blocks[0].group == LANDMARKS for f in self.problem.factors]
         return np.array(of, dtype=np.bool_)[self.rows.factor]
 
@@ -155,7 +155,7 @@ class Linear:
 
     @property
     def kept(self) -> Flags:
-        """Which residuals (N,) still count."""
+        """Flags (N,) of the residuals that count."""
         return self.noise < OUT
 
     def moved(self) -> BatchState:
@@ -173,24 +173,24 @@ class Linear:
         return np.asarray((np.concatenate(rows).T / self.noise).T)
 
     def left(self, z: Array, w: Array) -> Left:
-        """Return what the state leaves of data z (N, ...), w (q n, ...)."""
+        """Return the residuals of data z (N, ...), w (q n, ...)."""
         step, m = self.reduced.solved(z, w)
         return Left(z - self.at.H @ step, m)
 
     @cached_property
     def residuals(self) -> Left:
-        """What the state leaves of the data of the run."""
+        """Residuals of the data of the run."""
         return self.left(self.at.z, self.at.w)
 
     def simulated(self, number: int, seed: int = 0) -> Left:
-        """Return what is left of data of which everything is as configured, a column a set."""
+        """Return residuals of simulated data in which everything is as configured, a column a set."""
         rng = np.random.default_rng(seed)
         within = np.concatenate([self._within(factor) for factor in self.problem.factors])
         z, e = rng.normal(size=(len(self.at.z), number)), rng.normal(size=(self.root.shape[1], number))
         return self.left(z * within[:, None], self.root @ e)
 
     def _within(self, factor: Factor) -> Array:
-        """Return what a gate leaves of the noise of each row of a factor."""
+        """Return the share of the noise within a gate, of each row of a factor."""
         k, p = factor.R.shape[:2]
         left = self.within.get(factor.sensor, np.ones(p))
         return np.tile(left if len(left) == p else np.full(p, left.mean()), k)

@@ -36,7 +36,7 @@ Where = tuple[str, str]  # robot and sensor
 
 
 class Mistake(NamedTuple):
-    """What may have been done wrongly: its name, what it is, its cure, and the configuration and log without it.
+    """Mistake that may have been made: its name, description, cure, and the configuration and log without it.
 
     `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
     `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.  `shrunk` has the sensors
@@ -140,7 +140,7 @@ def _of_mounts(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
 
 
 def _turned(config: Mapping[str, Any], robot: str, sensors: list[str], turn: int, space: bool) -> Mistake:
-    """Return that sensors look so many degrees away from where their mounts say."""
+    """Return the mistake of sensors that are turned by so many degrees from their mounts."""
     name, cures = "yaw_deg" if space else "theta_rad", []
     of = f"the sensor {robot}.{sensors[0]} looks" if len(sensors) == 1 else f"{' and '.join(sensors)} of {robot} look"
     for sensor in sensors:
@@ -180,7 +180,7 @@ def _of_controls(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
 
 
 def late_scans(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
-    """Return that the scans of a robot were made so much later than their stamps say."""
+    """Return the mistake of scans of a robot that were made so much later than their stamps."""
     evidence = f"scans of {robot} were made {figure(abs(by_s))} s {'later' if by_s > 0 else 'earlier'} than stamped"
     cure = log_correction_line(config, "shift_s", (robot,), by_s)
     by_ns = round(by_s * 1e9)
@@ -197,7 +197,7 @@ def robot_section(config: Mapping[str, Any], robot: str) -> str:
 
 
 def configured_value(config: Mapping[str, Any], path: tuple[str, ...]) -> Any:
-    """Return what a configuration has at a path, None for nothing."""
+    """Return the value of a configuration at a path, None for none."""
     section: Any = config
     for key in path:
         section = section.get(key) if isinstance(section, Mapping) else None
@@ -219,7 +219,7 @@ def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> 
 
 
 def change_measurements(sensors: set[Where], change: Callable[[Array], Array]) -> Change:
-    """Return what changes the measurements y (K, m) of some sensors."""
+    """Return the function that changes the measurements y (K, m) of some sensors."""
 
     def changed(e: Event) -> Event:
         if isinstance(e, Scan) and len(e.y) and (e.robot, e.sensor) in sensors:

@@ -1,7 +1,7 @@
 """Causes of misfits of a sensor of the state: its noise, its mount, its constants, the signs of its columns.
 
 The log is filtered again with each of them changed, and the likelihoods of all innovations are compared.  A mount or a
-constant is put into the map with a sigma as large as the innovations: the filter says what it is.
+constant is put into the map with a sigma as large as the innovations: the filter estimates it.
 """
 
 from __future__ import annotations
@@ -84,13 +84,13 @@ class Filtered(NamedTuple):
 
 
 def filtered_with(config: Mapping[str, Any], log: Log, events: list[Event]) -> Filtered | None:
-    """Return how events fit under a configuration, None if they are refused."""
+    """Return the fit of events under a configuration, None if they are refused."""
     run = filter_events(config, log, events)
     return None if run is None else fit_of_readings(run)
 
 
 def fit_of_readings(run: Run) -> Filtered:
-    """Return how the observations of a run fit."""
+    """Return the fit of the observations of a run."""
     h = run.history
     known = np.isfinite(h.z)
     dof = known.sum(axis=1)
@@ -105,7 +105,7 @@ def likelihood_gain(before: Filtered, after: Filtered, scaled: Where | None = No
     """Return the logarithm of the likelihood ratio of two runs of the same events.
 
     Readings that are `scaled` do not count themselves: the filter takes the noise of a control for its own, so that
-    their likelihood says nothing of their size.
+    their likelihood does not depend on their size.
     """
     if len(before.d2) != len(after.d2):
         return -math.inf
@@ -156,7 +156,7 @@ class _Sensor:
 
     # ------------------------------------------------------------------ each kind
     def noise(self) -> Mistake | None:
-        """Return that it has more noise than stated: so many times that the innovations are as large as they say."""
+        """Return a trial with more noise than stated: by the factor at which the innovations fit their covariance."""
         keys = [
             k
             for k in dict.fromkeys(self.sensor.sigmas)
@@ -267,7 +267,7 @@ def _same(told: tuple[str, str], _: Filtered) -> tuple[str, str]:
 
 
 def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], Filtered | None]:
-    """Return what is wrong with sensors of the state of a run that does not fit, and how the log fits without it.
+    """Return the faults of sensors of the state in a run that does not fit, and the fit of the log without them.
 
     Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.
     """

@@ -69,7 +69,7 @@ class Change(NamedTuple):
 
     @property
     def changed(self) -> bool:
-        """Whether the value is another one."""
+        """True if the value is another one."""
         return bool(self.before != self.after)
 
 
@@ -83,7 +83,7 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What was changed and what was left, and how both parts of the log fit before and after.
+    """Changed keys, kept keys, and the fit of both parts of the log before and after.
 
     `correlations` are those of the errors of successive observations by sensor and column, `sigma_factor` is what the
     sigmas of the map are to be multiplied by for them.  `split_s` is the time between both parts since the first scan,
@@ -403,7 +403,7 @@ def _remove_systematic_error(path: Path_, value: float, s: float) -> float:
 
 
 def _widened(change: Change, wide: Mapping[Path_, float]) -> Change:
-    """Return a noise as large as says as little as the correlated one."""
+    """Return the white noise with the information of the correlated one."""
     factor = wide.get(change.path)
     if factor is None or not change.after:
         return change

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Aim(StrEnum):
-    """What the noise is to be right for, where errors last."""
+    """Purpose of the tuned noise, where errors are correlated."""
 
     INNOVATIONS = "innovations"
     MAP = "map"

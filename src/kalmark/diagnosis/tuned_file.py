@@ -66,7 +66,7 @@ def _put(content: CommentedMap, path: Sequence[str], value: Any) -> CommentedMap
 
 
 def _note(owner: CommentedMap, change: Change) -> None:
-    """Say beside a value that it was tuned, before what was said of it."""
+    """Add the comment that a value was tuned, before its old comment."""
     key, told = change.path[-1], f"tuned, was {_text(change.before)}"
     if owner.fa.flow_style():
         return  # a comment would end the line of a mapping in braces; the head of the file has it
@@ -94,7 +94,7 @@ def _head(source: Path, tuning: Tuning) -> str:
 
 
 def cells(change: Change) -> tuple[str, ...]:
-    """Return what became of a key, as the row of a table: key, before, after, known to, gain, why."""
+    """Return a key as the row of a table: key, before, after, known to, gain, why."""
     noise, bound = change.path[-1].startswith("sigma_"), change.why in ("at most", "at least")
     known = f"{figure(100 * change.sigma, 2)} %" if noise else figure(change.sigma, 2)
     sure = known if change.sigma and not bound else ""
@@ -116,7 +116,7 @@ def evidence(tuning: Tuning) -> list[str]:
 
 
 def correlation_lines(tuning: Tuning) -> list[str]:
-    """Return what is to be known of errors that last from observation to observation."""
+    """Return lines about errors that are correlated from observation to observation."""
     if not tuning.correlations:
         return []
     told = ", ".join(f"{name} {figure(rho, 2)}" for name, rho in tuning.correlations.items())

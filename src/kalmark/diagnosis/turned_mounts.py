@@ -1,4 +1,4 @@
-"""Sensors that were turned on the way: from some time on they look elsewhere than their mounts say.
+"""Sensors that were turned during a run: from some time on their direction differs from their mounts.
 
 A turn of a mount is a systematic error that begins at some time.  The time is that of the largest score (Basseville,
 Nikiforov 1993, section 2.4), looked for among stretches of the run, then within the best of them.
@@ -53,7 +53,7 @@ def find_turned_mounts(linear: Linear, t_s: Array) -> list[Finding]:
 
 
 def _turns(linear: Linear, f: int, factor: Factor) -> Iterator[Array]:
-    """Yield what one radian of a mount adds to the data (N,): about the axis of the plane or those of the robot."""
+    """Yield the change of the data (N,) by one radian of a mount: about the axis of the plane or those of the robot."""
     E, factors = factor.term.at(linear.state)[1], linear.problem.factors
     for axis in _axes(linear.state, factor):
         parts = [np.zeros(other.R.shape[:2]) for other in factors]
@@ -74,7 +74,7 @@ def _axes(state: BatchState, factor: Factor) -> Iterator[Array]:
 
 
 def _begins(linear: Linear, turn: Array, t_s: Array, seen_s: Array) -> tuple[float, float]:
-    """Return how much a turn of a mount explains from the best time on, and that time; 0 for none."""
+    """Return the gain of a turn of a mount from the best time on, and that time; 0 for none."""
     if len(seen_s) < STRETCHES:
         return 0.0, 0.0
     of_row, within, gain, begin_s = t_s[linear.rows.node], np.unique(seen_s), 0.0, 0.0

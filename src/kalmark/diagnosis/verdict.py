@@ -55,19 +55,19 @@ SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
 SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to associations comes after it
-STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped anew because of it
+STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped again because of it
 MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
-JUMP = "odometry_jump"  # the cause that controls say a motion that was none
+JUMP = "odometry_jump"  # the cause of controls that state a motion that did not take place
 MISPLACED = "misplaced_landmark"  # the cause that a landmark is not where its sightings have it
 COPIES = "copies"  # the cause that events come twice
-MISFIT = "misfit"  # the cause that innovations look wrong, and nothing says why
+MISFIT = "misfit"  # the cause of innovations that do not fit, without an explanation
 SEVERITY = dict.fromkeys((*JUMPS, "map_repeats", "lost"), WRONG) | {COPIES: OK}  # the others: doubtful
-LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that says something
+LEAST_SHARE = 0.3  # of the observations without ids that are of landmarks, in a map that determines the pose
 
 
 @dataclass(frozen=True)
 class Cause:
-    """What makes a run less than it could be, since when (s of the log), and what would cure it.
+    """Cause of errors in a run, its begin (s of the log), evidence and cure.
 
     `score` is the logarithm of the likelihood ratio against a run without it.  A noise that is stated too large is
     `harmless`: the map is as good as it would be, and better than it claims.
@@ -83,13 +83,13 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What is to be thought of a map: `map` is ok, unchecked, doubtful or wrong, the `causes` are why, best first.
+    """Judgement of a map: `map` is ok, unchecked, doubtful or wrong, by the `causes`, the likeliest first.
 
     `robots` is the same of the path of each robot: at best what the map is.
     `sigma_factor` is what the filter's sigmas are to be multiplied by, `accuracy_m` the sigma of a landmark's position
     after it in the world and `shape_accuracy_m` that without the motion of the world that the start leaves open
     (`kalmark.results.gauge`), all the median over landmarks; `shift_m` is by how much the shape of the map changes
-    without the causes.  `checked` says of what all this was made, `search` is how.
+    without the causes.  `checked` names the data behind all this, `search` has the details.
     """
 
     map: str
@@ -112,7 +112,7 @@ class Verdict:
 def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
     """Return the verdict on a run, from about so many of its observations; it is kept in the run's summary.
 
-    It reads the log without its truth (`blind`).  A bar on standard error tells how far it is if `progress`.  Raises
+    It reads the log without its truth (`blind`).  With `progress`, standard error shows a bar.  Raises
     KalmarkError if the log of the run cannot be read again.
     """
     run.run_plugins()
@@ -233,7 +233,7 @@ def _ordered(run: Run, first: list[Cause], found: Searched, causes: list[Cause])
 
 
 def _all_misfit(run: Run) -> Iterator[str]:
-    """Tell that the observations do not fit, all over the run, or that none was used."""
+    """Yield the cause that the observations do not fit in the whole run, or that none was used."""
     outcome = run.history.outcome
     if len(outcome) and not np.isin(outcome, ("associated", "new")).any():
         yield f"none of the {len(outcome)} observations was used"
@@ -324,7 +324,7 @@ def is_misplaced_survey(run: Run, finding: Finding) -> bool:
 
 
 def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
-    """Return what residuals cannot show: a place that is mapped twice still fits its data."""
+    """Return the causes that residuals cannot show: a place that is mapped twice still fits its data."""
     return [
         *find_kidnaps(run, log),
         *gaps(run),
@@ -344,7 +344,7 @@ def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
 
 
 def _started_elsewhere(run: Run) -> Iterator[Cause]:
-    """Yield the robots that did not start where it was said: the map was moved onto their fixes, so it does no harm."""
+    """Yield the robots that started elsewhere than stated; the map was moved onto their fixes, which does no harm."""
     for start in run.history.starts:
         restart = restarts(run.history).get(start.robot)
         if restart is not None:
@@ -430,7 +430,7 @@ def _remapped_landmarks(run: Run) -> Iterator[Cause]:
 
 
 def fits_nothing(run: Run) -> Iterator[Cause]:
-    """Yield that most observations without an id are of no landmark in the map: it says nothing of the place."""
+    """Yield the cause that most observations without an id are of no landmark: the map does not determine the pose."""
     h, now = run.history, fit_of_run(run)
     mine = (h.id == "") & (h.reason != NO_ID) & ~h.of_own
     share = float(np.mean(now.values[mine] < LOST)) if mine.any() else 1.0
@@ -441,7 +441,7 @@ def fits_nothing(run: Run) -> Iterator[Cause]:
 
 
 def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]:
-    """Return what is wrong with sensors of the state, and which do not fit all the same; whether that explains the run.
+    """Return the faults of sensors of the state, those that still do not fit, and whether that explains the run.
 
     They are further off than their noise and that of the pose allow.  More noise explains nothing for sure.
     """
@@ -479,7 +479,7 @@ def _copied(run: Run, log: Log) -> list[Cause]:
 
 
 def abandoned_surveys(run: Run) -> list[Cause]:
-    """Return the surveyed landmarks that the filter found elsewhere and mapped anew, which does no harm."""
+    """Return the surveyed landmarks that the filter found elsewhere and mapped again, which does no harm."""
     h, found, now = run.history, [], {str(id_): k for k, id_ in enumerate(run.landmarks.ids)}
     surveys = {prior.landmark: prior for prior in h.priors}
     for change in (c for c in h.changes if c.reason == ELSEWHERE and c.landmark in surveys and c.landmark in now):
@@ -538,7 +538,7 @@ def cause_of_repeats(summary: dict[str, Any]) -> list[Cause]:
 
 
 def find_kidnaps(run: Run, log: Log) -> Iterator[Cause]:
-    """Yield that a robot was carried away: what it saw until then vanished at once, and what it sees is mapped anew.
+    """Yield the kidnapped robots: their earlier landmarks vanish at once, and the landmarks in view are new.
 
     Chance does not do that, or the place is in the map already.  Not if its controls had stopped: then it may have
     driven.  With a control that is far larger than all others it is its odometry that jumps.
@@ -585,7 +585,7 @@ def split_landmarks(run: Run) -> Iterator[Cause]:
 def unseen_landmarks(run: Run) -> Iterator[Cause]:
     """Yield that landmarks are not seen again where they should be: they are in the map twice, or nowhere.
 
-    Of landmarks that are there a share `FEW` is marked by chance.  Where ids say what was seen, the times are counted
+    Of landmarks that are there a share `FEW` is marked by chance.  With ids, the times are counted
     at which landmarks came into view as before.
     """
     marks, h, found = run.landmarks, run.history, doubled_landmarks.unseen_counts(run)
@@ -622,7 +622,7 @@ def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
 # ------------------------------------------------------------------ what they do to the map
 @dataclass(frozen=True)
 class Effect:
-    """What the causes do to a map: as in `Verdict`; `claimed` is the filter's sigma over what the data allow."""
+    """Effect of the causes on a map: as in `Verdict`; `claimed` is the filter's sigma over what the data allow."""
 
     status: str = OK
     sigma_factor: float | None = None
@@ -634,7 +634,7 @@ class Effect:
 
 
 def effect_of(run: Run, found: Searched) -> Effect:
-    """Return what the causes do to the shape of a run's map and to its sigmas."""
+    """Return the effect of the causes on the shape of a run's map and on its sigmas."""
     rows = list(_shared(run, found.search))
     if not rows:
         return Effect()
@@ -658,7 +658,7 @@ def effect_of(run: Run, found: Searched) -> Effect:
         return Effect(shift_m=shift_m)
     off_it = share > LEAST and shift_m > SIGMAS * float(np.median(filtered[free]))
     status = OK if not off_it else DOUBTFUL if share < MOST_OFF else WRONG
-    shift_m = max(shift_m, by_steady)  # told, but no alarm: under noise that is stated too small it is too much
+    shift_m = max(shift_m, by_steady)  # reported, but no alarm: under noise that is stated too small it is too much
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     same_data = not waited and not filter_only_sensors(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data

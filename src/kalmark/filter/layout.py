@@ -128,7 +128,7 @@ class Layout:
         return [slot for slots in self._free.values() for slot in slots]
 
     def state(self) -> State:
-        """Return the blocks for a file, without their tables: these are built anew, so that they fit the arrays."""
+        """Return the blocks for a file, without their tables: these are built again, so that they fit the arrays."""
         return {
             "capacity": min(len(self.x), max(1024, 2 * self.n, 2 * self.x_n)),
             "blocks": [[space.name, list(space.kinds)] for space in self.shapes()],

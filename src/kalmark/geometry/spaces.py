@@ -243,7 +243,7 @@ class Space:
 
     @cached_property
     def steps(self) -> bool:
-        """Whether a translation of the world moves it by what depends on its value."""
+        """True if a translation of the world moves it by what depends on its value."""
         return HOMOGENEOUS in self.kinds or PLUECKER in self.kinds
 
     @cached_property

@@ -142,7 +142,7 @@ class _Calibration:
             raise LogError(f"{self.path}: {error}") from None
 
     def fisheye(self) -> bool:
-        """Return whether OpenCV's flag says that the lens is a fish-eye."""
+        """Return whether OpenCV's flag states a fish-eye lens."""
         return "fisheye_model" in self.content and self.one("fisheye_model") != 0
 
     def mount(self) -> Array | None:

@@ -66,7 +66,7 @@ class Dataset:
 
 
 class OwnCopy(NamedTuple):
-    """Describe a dataset that kalmark reads and does not fetch: `put` says where a copy of one's own belongs."""
+    """Describe a dataset that kalmark reads and does not fetch: `put` is the place for the user's own copy."""
 
     name: str
     what: str
@@ -93,7 +93,7 @@ OWN_COPIES = (
 
 @cache
 def list_data() -> tuple[Dataset, ...]:
-    """Return the datasets that `fetch` knows."""
+    """Return the datasets that `fetch` downloads."""
     text = resources.files("kalmark.logs").joinpath("datasets.json").read_text(encoding="utf-8")
     return tuple(
         Dataset(**{**entry, "files": tuple(DataFile(**file) for file in entry["files"])}) for entry in json.loads(text)
@@ -139,7 +139,7 @@ def fetch_one(dataset: Dataset, progress: Progress | None) -> Path:
             check(Path(provided) / file.file, file)
         return Path(provided)
     root = cache_folder()
-    with suppress(OSError):  # `download` says so
+    with suppress(OSError):  # `download` reports it
         root.mkdir(parents=True, exist_ok=True)
     with hold_lock(root):  # of two programs one downloads
         there = ((root / file.file, file.sha256) for file in dataset.files)

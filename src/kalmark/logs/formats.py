@@ -1,4 +1,4 @@
-"""`open_log`: tell a log's format by what is there, read it, and keep the robots and the time that were asked for."""
+"""`open_log`: recognise the format of a log, read it, and select robots and time."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def open_log(
 
     `robots` keeps some robots (names, or MRCLAM's numbers), `from_s` and `to_s` the events between these seconds
     from the log's first event.  With `on_error="skip"` bad rows are left out and listed in `log.skipped`.  With
-    `ids="hidden"` no scan says which landmark is which; `log.true_ids` does.
+    `ids="hidden"` the scans have no ids of landmarks; `log.true_ids` has them.
     `truth` and `fixes` are files of poses in the formats of TUM or KITTI, by robot if there are several: true poses to
     score against, and positions for the filter with the noise `sigma_fixes_m`,
     and `sigma_fixes_z_m` of their heights.
@@ -99,11 +99,11 @@ def stream_log(
     """
     _, found = recognise(find_data(path), NATIVE.name)
     request = request_of(robot_names(robots), on_error, progress)
-    return (event for event in stream(found, request) if request.wants(event.robot))
+    return (event for event in stream(found, request) if request.includes(event.robot))
 
 
 def request_of(robots: tuple[str, ...] | None, on_error: str, progress: bool = False) -> Request:
-    """Return what the caller asked for.  Raises LogError."""
+    """Return the request of the caller.  Raises LogError."""
     skipped: list[str] = []
     refuse = (
         raise_refusal
@@ -224,7 +224,7 @@ def keep_robots(log: Log, request: Request) -> Log:
 
 
 def select_robots(table: dict[str, Any], robots: Sequence[str]) -> dict[str, Any]:
-    """Return what a table by robot has of these robots."""
+    """Return the entries of these robots in a table by robot."""
     return {name: value for name, value in table.items() if name in robots}
 
 

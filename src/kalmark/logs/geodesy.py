@@ -46,7 +46,7 @@ def to_tangent_plane(lla: Any, origin: Any) -> Array:
 
 
 def fault(lla: Any) -> str:
-    """Return what is wrong with latitude and longitude (deg), "" if they are some."""
+    """Return the fault of a latitude and longitude (deg), "" without one."""
     lat, lon = lla[0], lla[1]
     if np.isfinite([lat, lon]).all() and abs(lat) <= 90 and abs(lon) <= 360:
         return ""
@@ -68,7 +68,7 @@ def origin_of(given: Any, what: str) -> Array | None:
 
 @dataclass
 class Globe:
-    """Where the tangent plane touches the Earth: `origin` (3,), latitude, longitude (deg) and height (m).
+    """Origin of the tangent plane on the Earth: `origin` (3,), latitude, longitude (deg) and height (m).
 
     None until it is known: then it is the first position that is asked for.
     """

@@ -52,7 +52,7 @@ def _decoded(path: Path, flag: int) -> Any:
 
 
 def flaw(path: Path) -> str:
-    """Return what is wrong with an image file, as its end shows: "missing", "cut short", or nothing."""
+    """Return the fault of an image file, by its end: "missing", "cut short", or ""."""
     try:
         with path.open("rb") as stream:
             begin = stream.read(3)
@@ -182,7 +182,7 @@ def video_images(path: Path) -> Iterator[Any]:
 
 
 def video_facts(path: Path) -> tuple[int, float]:
-    """Return how many images a video says that it has, and its rate [Hz], 0 if it does not say.  Raises LogError."""
+    """Return the number of images and the rate [Hz] that a video states, 0 if it does not.  Raises LogError."""
     cv2 = opencv(path)
     with warnings.catch_warnings():
         video = cv2.VideoCapture(str(path))

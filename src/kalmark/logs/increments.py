@@ -29,7 +29,7 @@ CUT = INCREMENT2, INCREMENT3, WHEELS  # columns of increments that can be cut
 def cut_increments(log: Log) -> Log:
     """Return a log with its increments cut at the scans, frames and fixes between their ends.
 
-    Those of a robot are cut, too, where another one says by its name that it sees it.
+    Those of a robot are also cut at the scans of other robots that observe it by its name.
     """
     events: list[Event] = [event for event in log.events if not isinstance(event, Control)]
     asked: dict[str, set[int]] = defaultdict(set)

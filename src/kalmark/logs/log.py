@@ -121,8 +121,8 @@ class Log:
     `truth` and `gps` are by robot, `landmarks` are by id: true positions (2,) or (3,) m, both ends of a line (6,) or
     the pose of a tag (7,) (all {} where unknown).  `skipped` has one line for each thing left out; `control_columns`
     (by robot) and `sensor_columns` (by robot and sensor) name what the numbers of a control and an observation are;
-    `places` says in which file and line those of a sensor begin (of a robot's controls: sensor ""), where it is known.
-    `describes` is what the source itself says of the rig, its calibration, mounts, noise and start, in the shape of
+    `places` has the file and line where those of a sensor begin (of a robot's controls: sensor ""), if known.
+    `describes` is the source's own description of the rig, its calibration, mounts, noise and start, in the shape of
     a configuration, which may overrule it.  `reference` has figures of other programs on this log, by program, named
     as in ``summary.json``.  `true_ids` has the landmarks of scans whose ids are hidden, to score the association.
     `options` are those it was opened with, as the section `log` of a configuration has them.

@@ -34,7 +34,7 @@ def log_from(
     """Return the log of tables in memory, each with the columns of the file of its name in a native log.
 
     A table is a frame of pandas or polars, a table of pyarrow, or a mapping of columns to arrays, lists, or to one text
-    or number for all rows.  None and NaN are empty cells.  `describes` is what a `rig.yaml` would say.  The other
+    or number for all rows.  None and NaN are empty cells.  `describes` has the content of a `rig.yaml`.  The other
     arguments are those of `open_log`.  Raises LogError, with table and row (from 1) for a bad one.
     """
     given = dict(zip(FILES, (controls, scans, fixes, truth, landmarks, gps, measurements), strict=False))

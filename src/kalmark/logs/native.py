@@ -123,7 +123,7 @@ def log_of_tables(
 
 
 def read_rig(path: Path) -> dict[str, Any]:
-    """Return what `rig.yaml` describes.  Raises LogError if it is no mapping with a mapping of robots."""
+    """Return the content of `rig.yaml`.  Raises LogError if it is no mapping with a mapping of robots."""
     content = read_mapping(path)
     robots = content.get("robots", {})
     if not isinstance(robots, dict):
@@ -136,7 +136,7 @@ def read_rig(path: Path) -> dict[str, Any]:
 
 @dataclass
 class _Rows:
-    """Gather the observations of one scan; a bad row is left out, an empty one says that the scan saw nothing."""
+    """Collect the observations of one scan; a bad row is left out, an empty one is a scan without observations."""
 
     t_ns: int
     y: list[list[float]] = field(default_factory=list)

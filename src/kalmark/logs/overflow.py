@@ -18,7 +18,7 @@ OFF = 0.2  # of a step: increments are whole numbers of steps up to this
 
 
 def refuse_overflow(log: Log) -> None:
-    """Refuse increments of wheels across an overflow of their counter, and say what to add.  Raises LogError."""
+    """Refuse increments of wheels across an overflow of their counter.  Raises LogError with the number to add."""
     for robot, columns in log.control_columns.items():
         controls = [event for event in log.events if isinstance(event, Control) and event.robot == robot]
         if columns != WHEELS or not controls:

@@ -90,7 +90,7 @@ def plain_text(path: Path, request: Request) -> str:
 
 
 def order_in(header: list[str]) -> list[int] | None:
-    """Return where a header of eight names has t, x, y, z, qx, qy, qz, qw; None if it does not name the quaternion."""
+    """Return the columns of t, x, y, z, qx, qy, qz, qw in a header of eight names; None without a quaternion."""
     names = [name.lower().replace("_", "") for name in header]
     q = [[k for k, name in enumerate(names) if name.endswith(f"q{axis}")] for axis in TUM_NAMES]
     if len(names) != TUM_CELLS or any(len(at) != 1 for at in q):

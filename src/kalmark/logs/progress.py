@@ -23,7 +23,7 @@ def track(
 ) -> Iterator[T]:
     """Yield the items; after `delay_s` seconds show a bar named `what` on standard error, if `show`.
 
-    `at` says how much of `total` is done, if that is not the number of items; `note` is what stands behind the bar.
+    `at` is the done part of `total`, if that is not the number of items; `note` is the text behind the bar.
     """
     if not show:
         yield from items

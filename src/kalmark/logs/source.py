@@ -36,7 +36,7 @@ STEP_NS = 1_000_000_000
 
 
 class LeftOut(str):
-    """A line that tells of several `records` left out of a log; a plain text tells of one."""
+    """A line about several `records` left out of a log; a plain text is about one."""
 
     records: int
 
@@ -48,7 +48,7 @@ class LeftOut(str):
 
 
 def records_of(line: str) -> int:
-    """Return how many records a line tells of that were left out."""
+    """Return the number of left-out records that a line stands for."""
     return line.records if isinstance(line, LeftOut) else 1
 
 
@@ -69,18 +69,18 @@ class Request:
         """List that so many records were left out."""
         self.skipped.append(LeftOut(line, records))
 
-    def wants(self, robot: str) -> bool:
+    def includes(self, robot: str) -> bool:
         """Return whether this robot was asked for."""
         return self.robots is None or robot in self.robots
 
 
 @dataclass(frozen=True)
 class Format:
-    """Describe one log format: how to tell it (`find` gives the path to read, or None) and how to read it.
+    """Describe one log format: `find` recognises it (the path to read, or None), `read` reads it.
 
     `read` takes that path, a `Request`, and the format's own options, each declared as a parameter of a model is: from
     the annotations follow their checks, keys of configurations and documentation.  A `general` one is recognised where
-    no other is.  With `describes_all` a log says all that a configuration needs.  `robots` are those that a log may
+    no other is.  With `describes_all` a log has all that a configuration needs.  `robots` are those that a log may
     observe, in it or not; `known_maps` reads files of landmarks known beforehand, by the endings of their names.
     """
 

@@ -55,7 +55,7 @@ _COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
 
 
 class Content(NamedTuple):
-    """What a source has: its header with the place of it, rows with their numbers, and how much of it has been read.
+    """Content of a source: its header with the place of it, rows with their numbers, and how much of it has been read.
 
     `comma`: numbers may have a decimal comma.  `word` is what stands before the number of a row in messages.
     """
@@ -103,7 +103,7 @@ class Table:
         self, request: Request, make: Callable[[Row], T | None], timed: bool = True, by_sensor: bool = False,
         strictly: bool = False,
     ) -> Iterator[T]:  # fmt: skip
-        """Yield what `make` makes of every row; refuse those that it refuses, or with other cells than the header has.
+        """Yield `make` of every row; refuse a row that it refuses, or with another number of cells than the header.
 
         If `timed`, refuse those whose time runs backwards, or `strictly` stands still, within a robot (and sensor).
         Raises LogError if there is no row.
@@ -150,7 +150,7 @@ class Table:
 
 
 def open_source(source: Path | Content) -> Content:
-    """Return what a source has.  Raises LogError if it is missing, empty or none of its kind."""
+    """Return the content of a source.  Raises LogError if it is missing, empty or none of its kind."""
     if isinstance(source, Content):
         return source
     return _of_parquet(source) if source.suffix == PARQUET else _of_csv(source)
@@ -186,9 +186,9 @@ def _of_parquet(path: Path) -> Content:
 
 
 def _of_csv(path: Path, separator: str = ",") -> Content:
-    """Return what a CSV file has; where its header has semicolons and no comma, they separate the cells."""
+    """Return the content of a CSV file; where its header has semicolons and no comma, they separate the cells."""
     if path.suffix == CSV and not path.is_file():
-        read_text(path)  # says why
+        read_text(path)  # raises with the reason
     stream = path.open("rb")
     encoding = "utf-16" if stream.read(2) in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     stream.seek(0)
@@ -202,7 +202,7 @@ def _of_csv(path: Path, separator: str = ",") -> Content:
         except csv.Error as error:
             raise LogError(f"{path}:{reader.line_num}: {error}, expected comma separated values") from None
         except UnicodeError:
-            read_text(path)  # says where
+            read_text(path)  # raises with the line
             raise LogError(f"{path}: not text, expected a text file in UTF-8") from None
         finally:
             stream.close()
@@ -327,7 +327,7 @@ def decimal_point(text: str) -> str:
 
 
 class Refused(Exception):
-    """What is wrong with a row."""
+    """Reason why a row is refused."""
 
 
 class Row:

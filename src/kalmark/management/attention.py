@@ -23,7 +23,7 @@ Group = tuple[ObservationModel, list[int]]
 
 @register("attention", "attention")
 class Attention:
-    """Which landmarks of a scan are corrected, where new ones are taken, and when one is given up.
+    """Selection of the landmarks to correct, of places for new ones, and of landmarks to remove.
 
     By default all is used and none given up.
     """

@@ -43,7 +43,7 @@ LEAST, MOST = 2.0, 512  # looks at a landmark that has a share of its own; such 
 SURE = 1e6  # looks that a stated detection probability is worth
 MEANS, WORTH = np.linspace(0.05, 0.98, 32)[None], np.geomspace(1.0, 256.0, 9)[:, None]  # of densities that are tried
 SHARES = 1e-3, 1e-2, 3e-2, 0.1, 0.3, 0.5  # of landmarks that never were there
-REFIT = 64  # looks until the detection probability is found anew
+REFIT = 64  # looks until the detection probability is estimated again
 
 
 class Detection(NamedTuple):

@@ -62,7 +62,7 @@ class Merge(NamedTuple):
 
 
 class MergeSearch:
-    """Which landmarks to compare after a scan: those observed in it, and what is covisible with merged ones."""
+    """Landmarks to compare after a scan: those observed in it, and those covisible with merged ones."""
 
     def __init__(self, tracks: Tracks, observed: Sequence[Id]) -> None:
         self._tracks, self._observed = tracks, iter(observed)
@@ -96,7 +96,7 @@ class MergeSearch:
 
     @property
     def is_first_pass(self) -> bool:
-        """Whether the landmarks of the scan itself are being compared."""
+        """True if the landmarks of the scan itself are being compared."""
         return self._tried is None
 
     def _is_due(self, name: Id) -> bool:

@@ -3,8 +3,8 @@
 The poses are clones in the map, so that they are corrected with everything else and their errors are correlated as
 they are.  The position l minimises the chi-square of all ranges kept, y_i = h(l - s_i), whose errors are those of the
 places s of the sensor, of the sensor's own parameters and of the ranges, marginalised: Sigma = H_x P H_x' + R.  The
-search starts in every direction; it is answered when one minimum alone is left and is as Gaussian as its covariance
-says.  Then the landmark is a function of the map, l = g(x, y), and enters as any other does.  [S] (32)-(38);
+search starts in every direction; it ends when one minimum alone is left whose chi-square is that of its covariance
+within a sigma.  Then the landmark is a function of the map, l = g(x, y), and enters as any other does.  [S] (32)-(38);
 docs/range_only.md.
 """
 

@@ -18,7 +18,7 @@ class Upkeep:
 
     With `merge`, two landmarks that turn out to be one are merged (`merge.py`) when that is `odds` times
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
-    (`association/ratio.py`); what is held back by that is mapped anew until then, as are observations of a robot that
+    (`association/ratio.py`); what is held back by that is mapped again until then, as are observations of a robot that
     is lost.
 
     With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are
@@ -41,7 +41,7 @@ class Upkeep:
     ] = "off"
     hold_back: Annotated[
         bool,
-        "Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it anew.",
+        "Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it again.",
     ] = False
     odds: Annotated[float, Within(ge=1), "So many times likelier than chance is beyond doubt."] = 100.0
     gone: Annotated[Literal["mark", "remove"], "What becomes of landmarks that are not seen again."] = "mark"
@@ -65,7 +65,7 @@ class Upkeep:
 
     @property
     def removes(self) -> bool:
-        """Whether landmarks that are not seen again are removed."""
+        """True if landmarks that are not seen again are removed."""
         return self.gone == "remove" or self.p_detect is not None
 
     def confirms(self, hits: int) -> bool:

@@ -222,7 +222,7 @@ class Sensing:
 
     @property
     def angular(self) -> tuple[bool, ...]:
-        """Which components are angles: those in rad."""
+        """Flags of the components that are angles: those in rad."""
         return tuple(column.endswith("_rad") for column in self.columns)
 
     def noise(self, y: Array) -> Array:

@@ -45,7 +45,7 @@ class CheckResult:
 
     @property
     def ok(self) -> bool:
-        """Whether the difference is small enough."""
+        """True if the difference is small enough."""
         return self.error <= TOLERANCE
 
 

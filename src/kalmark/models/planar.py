@@ -158,7 +158,7 @@ class _Ranging(Expecting):
 
     @property
     def additive(self) -> bool:
-        """Whether the range's noise does not grow with it."""
+        """True if the range's noise does not grow with it."""
         return self.sigma_range_rel == 0.0
 
     def range_variance(self, y: Array) -> Array:

@@ -40,7 +40,7 @@ class _OnceAClass(type(Protocol)):  # type: ignore[misc]
 
 
 class Capability(Protocol, metaclass=_OnceAClass):
-    """What all models of a class offer, or none of them."""
+    """Capability of all models of a class, or of none of them."""
 
 
 @runtime_checkable
@@ -82,7 +82,7 @@ class Sensor(Capability, Protocol):
 
     @property
     def angular(self) -> tuple[bool, ...]:
-        """Which components are angles, whose differences are wrapped."""
+        """Flags of the components that are angles, whose differences are wrapped."""
 
     def expect(self, v: Array) -> tuple[Array, Array]:
         """Return the expected measurements (K, m) of v (K, d), and E_v (K, m, d)."""

@@ -17,7 +17,7 @@ LEAST = 3  # matched pairs
 
 
 def names_in_log(history: History) -> dict[str, str]:
-    """Return what the log calls each landmark that the filter named: what most observations fused with it are."""
+    """Return the log's name of each landmark named by the filter: that of most observations fused with it."""
     seen: defaultdict[str, Counter[str]] = defaultdict(Counter)
     mine = history.fused & (history.true_id != "") & (history.id == "")
     for landmark, true in zip(history.landmark[mine].tolist(), history.true_id[mine].tolist(), strict=True):

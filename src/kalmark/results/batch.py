@@ -1,7 +1,7 @@
 """The distance of a filter from the maximum likelihood of the same data: the entry `batch` of ``summary.json``.
 
 The strongest check of a filter on data without truth.  A consistent filter ends with the same map as the batch solution
-to a fraction of its sigma, and with the same sigma; one that is not claims to know better than the optimum can.
+to a fraction of its sigma, and with the same sigma; one that is not claims a smaller sigma than the optimum has.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def solve_batch(
 
 
 def batch_input(run: Recording, known: Known | None = None, rows: Index | None = None) -> BatchInput:
-    """Return what the batch solution needs of a run: of the observations exactly those that the filter used.
+    """Return the input of the batch solution of a run: of the observations exactly those that the filter used.
 
     With `rows` of the history these are read; those that the filter did not use are of no landmark.
     """
@@ -318,7 +318,7 @@ def tag_problem(run: Recording) -> Problem:
 
 
 def compare_with_filter(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None) -> dict[str, Any]:
-    """Return how far the filter's map and path are from the optimum of the same data.
+    """Return the distances of the filter's map and path from the optimum of the same data.
 
     `merged` maps landmarks of the filter to those of the batch solution that they were merged into.
 

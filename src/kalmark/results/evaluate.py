@@ -278,7 +278,7 @@ def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
 
 
 def line_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
-    """Return how far the true ends of lines are from the estimated lines, over those whose place is settled.
+    """Return the distances of the true ends of lines from the estimated lines, over those with a settled place.
 
     Across the lines: along them nothing is known.  Nothing is aligned.
     """

@@ -47,7 +47,7 @@ class Fate:
 
     @property
     def near(self) -> list[Candidate]:
-        """What to draw of what it was compared with: what it may be of, the landmark decided on, and the nearest."""
+        """Candidates to draw: those within the gate, the landmark decided on, and the nearest."""
         least = min((other.d2 for other in self.compared if other.d2 <= FARTHEST), default=0.0)
         return [c for c in self.compared if c.d2 <= max(FAR, least) or c.landmark == self.landmark]
 
@@ -94,7 +94,7 @@ class Explanation:
 
 
 def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation:
-    """Return why the scan nearest to a time became what it did.
+    """Return the explanation of the association of the scan nearest to a time.
 
     `t_s` is a time of the log, as in ``associations.csv``; where the log has no scan then, it counts from the first
     scan, as in the report.  Raises RunError if there is no such robot or scan.
@@ -159,7 +159,7 @@ def _seen(slam: Slam, told: Explanation, y: Array) -> Array:
 
 
 def explain_step(run: Recording, step: int) -> Explanation:
-    """Return why the scan of a step became what it did."""
+    """Return the explanation of the association of the scan of a step."""
     history = run.history
     rows = np.flatnonzero(history.step == step)
     sensor = str(history.sensor[rows[0]]) if len(rows) else ""
@@ -170,7 +170,7 @@ def explain_step(run: Recording, step: int) -> Explanation:
 
 
 def fate_of(history: History, row: int) -> Fate:
-    """Return what became of an observation."""
+    """Return the outcome of an observation."""
     index, names, d2 = int(history.index[row]), history.candidate_landmark, history.candidate_d2
     mine = np.flatnonzero(history.candidate_row == row)
     mine = mine[np.argsort(d2[mine], kind="stable")]

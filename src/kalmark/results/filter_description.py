@@ -118,7 +118,7 @@ def _in_map(slam: Slam, name: str) -> bool:
 
 
 def mount_now(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
-    """Return where a sensor sits on its robot: as given, or as estimated so far if its mount is in the map."""
+    """Return the mount of a sensor: as given, or as estimated so far if its mount is in the map."""
     name = f"{robot}.{sensor}"
     return np.array(slam.mean(name)[: len(at)] if _in_map(slam, name) else at, dtype=np.float64)
 
@@ -147,7 +147,7 @@ def stated_noise(slam: Slam, report: Report) -> Array:
 
 
 def residual_px(slam: Slam, scan: Scan, report: Report) -> Array:
-    """Return what a scan's correction leaves of each observation (K,): the RMS of a tag's corners, NaN of all else.
+    """Return the residual of each observation (K,) after a scan: the RMS of a tag's corners, NaN of all else.
 
     `slam` is the filter just after the scan; an observation that it did not use has NaN, too.
     """

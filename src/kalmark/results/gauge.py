@@ -1,7 +1,7 @@
 """Covariances of the shape of a map: without the rigid motion of the world that its errors have in common.
 
-A rigid motion g of robots and landmarks together changes no measurement between them.  Where the start alone says where
-the world is, all errors have its error in common, e = G g + s, G = [1, J (p - o)] of a point p, in space
+A rigid motion g of robots and landmarks together changes no measurement between them.  If the start alone determines
+the place of the world, all errors have its error in common, e = G g + s, G = [1, J (p - o)] of a point p, in space
 [1, -[p - o]x], about an origin o.  The shape is judged after the motion that aligns the map best with the true one,
 
     g = T e,    T = (G' W G)^-1 G' W,
@@ -15,7 +15,7 @@ the error that an aligned RMSE measures.  (1 - G T) G = 0: P_shape does not depe
 which robot starts where.  The weights W are 1 / (v + v_q), v the variances of the shape itself and v_q their lower
 quartile: landmarks that are hardly known, such as points at great depth, do not move the datum.  Landmarks that are
 known exactly are fixed points of g: with two of them, in space three, nothing is open.  Where fixes or known landmarks
-tell where the world is, g is small, and shape and world coincide.  docs/evaluation.md.
+determine the place of the world, g is small, and shape and world coincide.  docs/evaluation.md.
 """
 
 from __future__ import annotations

@@ -290,22 +290,22 @@ class History:
 
     @property
     def fused(self) -> Flags:
-        """Which observations (O,) have corrected or started what is in the map."""
+        """Flags (O,) of the observations that corrected or initialized blocks of the map."""
         return np.isin(self.outcome, ("associated", "new")) | self.late
 
     @property
     def of_own(self) -> Flags:
-        """Which observations (O,) are readings of a robot itself, by a sensor of its state."""
+        """Flags (O,) of the readings of a robot itself, by a sensor of its state."""
         return np.asarray(self.landmark == self.robot[self.step])
 
     @property
     def localizes(self) -> bool:
-        """Whether each sensor that made observations read its own robot: no landmark is to be expected."""
+        """True if each sensor that made observations read its own robot: no landmark is to be expected."""
         return len(self.sensor) > 0 and {*self.sensor.tolist()} == {*self.sensor[self.of_own].tolist()}
 
     @property
     def in_space(self) -> bool:
-        """Whether the robots move in space."""
+        """True if the robots move in space."""
         return self.mean.shape[1] > 6  # in the plane a state may have a velocity or a slip behind its pose
 
     @property

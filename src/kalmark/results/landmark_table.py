@@ -11,7 +11,7 @@ wall        both endpoints, x y x2 y2       the same                    4, 4
 tag         x y z qx qy qz qw               x y z, rotation vector      7, 6
 ==========  ==============================  ==========================  =====
 
-Whatever else a landmark is in the map (inverse depth, homogeneous, Pluecker), its model says where that is: by `place`,
+Whatever else a landmark is in the map (inverse depth, homogeneous, Pluecker), its model has its position: by `place`,
 lines by `endpoints` at the abscissas of their ends (`kalmark.models.protocols.HasPlace`, `Segmented`).
 """
 

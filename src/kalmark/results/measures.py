@@ -295,7 +295,7 @@ def map_nees(d: Array, P: Array, first: Index, sizes: Index) -> Array:
 
 
 def nees_limit(d: Array, P: Array) -> float:
-    """Return what the mean NEES of errors d (N, n), covariances P (N, n, n), one after the other, may be in a good run.
+    """Return the limit of the mean NEES of errors d (N, n), covariances P (N, n, n), of a consistent run.
 
     They are worth N / (1 + 2 sum (1 - k / N) |C_k|^2 / n) independent ones, one at least: C_k (n, n) is the correlation
     of errors in their sigmas over k steps, up to the first of which the trace is not positive.  The mean is below

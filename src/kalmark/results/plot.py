@@ -63,7 +63,7 @@ class Stroke(NamedTuple):
 
 
 def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim: bool = True) -> None:
-    """Write a figure as a PNG, completely or not at all, with a narrow rim around all that is drawn, or as it is.
+    """Write a figure as a PNG, completely or not, with a narrow rim around the drawing, or as it is.
 
     matplotlib draws twice to find that box, which only a figure with a layout of its own needs.
     """

@@ -109,7 +109,7 @@ class _Labels:
         self.taken = np.hstack([centres - MARK, centres + MARK])
 
     def paper(self, at: Array) -> Array:
-        """Return where a place (2,) of the map is on paper."""
+        """Return the place on paper of a place (2,) of the map."""
         out: Array = (at - self.low) * self.scale
         return out
 

@@ -177,7 +177,7 @@ class _Recorder:
         self.spent_ns = 0
 
     def rate(self) -> str:
-        """Return how many images a second the latest ones took, in words; of a log with images."""
+        """Return the rate of the latest images as a text; of a log with images."""
         latest = [ns for ns in self.step_ns[-LATEST:] if not math.isnan(ns)]
         return f"{1e9 * len(latest) / sum(latest):.0f} images/s" if self.has_images and latest else ""
 

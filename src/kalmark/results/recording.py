@@ -139,7 +139,7 @@ def file_name(robot: str) -> str:
 
 @dataclass(frozen=True)
 class LogReference:
-    """Which log a run was made from; a plain list of events has no name."""
+    """Log of a run; a plain list of events has no name."""
 
     name: str = ""
     format: str = ""

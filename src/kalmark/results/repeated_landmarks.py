@@ -60,7 +60,7 @@ def repeat_notes(history: History) -> Iterator[str]:
 
 
 def _start_s(history: History, landmarks: list[str]) -> float | None:
-    """Return when some of these landmarks had been observed: one or two may be of the older part."""
+    """Return the time at which some of these landmarks had been observed: one or two may be of the older part."""
     mine = np.isin(history.landmark, landmarks)
     first = np.sort(history.step[mine][np.unique(history.landmark[mine], return_index=True)[1]])
     return float(history.t_ns[first[min(len(first), SOME) - 1]]) * 1e-9 if len(first) else None

@@ -227,7 +227,7 @@ def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
 def _camera(
     run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array, pictures: Pictures
 ) -> dict[str, Any]:  # fmt: skip
-    """Return what a camera saw last at each of the maps: `frames` are indices of its `scans`, None before the first."""
+    """Return the last images of a camera at the maps: `frames` are indices of its `scans`, None before the first."""
     steps = steps_of(run.history, camera)
     last = np.searchsorted(steps, [m.step for m in maps], side="right") - 1
     used = np.unique(last[last >= 0])
@@ -325,7 +325,7 @@ def _nis(run: Recording, t: Array) -> dict[str, Any]:
 
 
 def _outcomes(run: Recording, t: Array) -> dict[str, Any]:
-    """Return how many observations had which outcome in each of some 120 stretches of time."""
+    """Return the numbers of observations by outcome in each of some 120 stretches of time."""
     history = run.history
     edges = np.linspace(0.0, max(float(t[-1]), 1e-9) if len(t) else 1.0, BINS + 1)
     when = t[history.step]

@@ -13,7 +13,7 @@ from kalmark.slam.replacing import NEEDED
 
 
 class Restart(NamedTuple):
-    """When the map was moved onto the first fixes, how (`onto`), how far, m, and how many fixes that were.
+    """Move of the map onto the first fixes: time, way (`onto`), distance, m, and number of fixes.
 
     `agreed` (N, d) are the fixes that it was moved onto, of the `variance`, m^2.
     """

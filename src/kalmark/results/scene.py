@@ -93,7 +93,7 @@ class Scene:
 
     @classmethod
     def of(cls, run: Recording, step: int | None = None, world: bool = False) -> Scene:
-        """Return what to draw of a run after a step, by default the last; the box is that of the whole run."""
+        """Return the scene of a run after a step, by default the last; the box is that of the whole run."""
         history, d = run.history, run.history.d
         known = np.isfinite(run.truth.poses).all(axis=1)
         aligned = bool(known.any()) and not (run.truth.frame == "truth" and (world or run.truth.anchored))
@@ -192,13 +192,13 @@ class Scene:
         return np.where(out.any(axis=-1, keepdims=True), np.nan, lines)
 
     def frames(self, robot: str) -> list[Array]:
-        """Return what is drawn of a robot along its path: the pyramids of its cameras, or a dart if it has none."""
+        """Return the shapes of a robot along its path: the pyramids of its cameras, or a dart if it has none."""
         path, body = self.paths[robot], self.body(robot)
         at = np.unique(np.linspace(0, max(len(path) - 1, 0), FRAMES).round().astype(int))
         return [_placed(pose, line) for pose in path[at[: len(path)]] for line in body]
 
     def body(self, robot: str) -> list[Array]:
-        """Return what is drawn of a robot in space as polylines (P, 3) in its own frame: pyramids, or a dart."""
+        """Return a robot in space as polylines (P, 3) in its own frame: pyramids, or a dart."""
         size, lines = 0.03 * self.size, []
         for camera in self.cameras:
             if camera.robot == robot:
@@ -212,12 +212,12 @@ class Scene:
         return [l.reshape(2, self.d) for l in self.true_landmarks.values() if len(l) == 2 * self.d]
 
     def true_points(self) -> dict[Id, Array]:
-        """Return where the true landmarks are (d,), but for lines."""
+        """Return the true positions (d,) of landmarks, without lines."""
         return {i: l[: self.d] for i, l in self.true_landmarks.items() if len(l) != 2 * self.d}
 
 
 def map_shapes(kept: MapSnapshot, d: int, world: bool) -> Shapes:
-    """Return what is drawn of a map that was kept, with the covariances of its shape or in the world."""
+    """Return the shapes of a kept map, with the covariances of its shape or in the world."""
     return shapes(kept.means, kept.covariances if world else kept.shape, kept.kinds, d)
 
 
@@ -254,7 +254,7 @@ def join_polylines(lines: Sequence[Array] | Array, d: int = 3) -> Array:
 
 
 def stretches_of(t_ns: Ints) -> Ints:
-    """Return how many gaps are before each of a robot's steps (N,): 3 s, and ten times the median, without a scan."""
+    """Return the number of gaps before each of a robot's steps (N,): 3 s, and ten times the median, without a scan."""
     steps = np.diff(t_ns) * 1e-9
     if not len(steps):
         return np.zeros(len(t_ns), dtype=np.int64)

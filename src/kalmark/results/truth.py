@@ -59,11 +59,11 @@ class Truth:
 
     @property
     def frame(self) -> str:
-        """Whether the map is in the frame of the truth ("truth") or in that of the first robot's start ("start")."""
+        """True if the map is in the frame of the truth ("truth") or in that of the first robot's start ("start")."""
         return "truth" if np.array_equal(self.offset, ORIGIN[len(self.offset)]) else "start"
 
     def to_map(self) -> Rigid:
-        """Return what takes positions from the truth's frame to the map's."""
+        """Return the transform from the truth's frame to the map's."""
         return as_rigid(self.offset)
 
     def poses_in_map(self) -> Array:

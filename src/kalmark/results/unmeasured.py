@@ -57,7 +57,7 @@ class ExpectationRecorder:
         self._scans += 1
 
     def spent_ns(self) -> int:
-        """Return how long the last event was held up by it."""
+        """Return the time (ns) that it spent on the last event."""
         spent, self._spent = self._spent, 0
         return spent
 

@@ -63,7 +63,7 @@ def _mp4(drawn: Iterator[Figure], fps: float, path: Path) -> None:
     writer: Any = FFMpegWriter(fps=fps)  # type: ignore[arg-type]
     with writer.saving(next(drawn), str(path), DPI):
         writer.grab_frame()
-        for _ in drawn:  # the same figure, drawn anew
+        for _ in drawn:  # the same figure, drawn again
             writer.grab_frame()
 
 
@@ -80,7 +80,7 @@ def _picture(figure: Figure) -> Image.Image:
 
 
 def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool, world: bool) -> Iterator[Figure]:
-    """Yield one figure again and again, drawn anew after each of the steps."""
+    """Yield one figure again and again, drawn again after each of the steps."""
     figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     t_s, title, pictures = run.history.t_s, headline(run)[0], Pictures(run)

@@ -6,10 +6,10 @@ taken in windows of time.  Bar-Shalom, Li, Kirubarajan 2001, section 5.4: time-a
 innovations.
 
 Is a noise too large?  An innovation has the noise of its measurement in it, and the uncertainty of pose and map on top:
-E[z z'] = H P H' + R is at least R, whatever P the filter believes in.  Squares of z that add up to far less than R
-therefore say that R is too large, and by how much at least.  They do not say it of errors that last from one sighting
-to the next: the map takes those in, and a larger white noise is a fair price for them.  So nothing is said where the
-truth shows the filter to be too sure of itself already.
+E[z z'] = H P H' + R is at least R for every P.  If the mean square of z is far below R, R is therefore too large, at
+least by their ratio.  This does not hold for errors that are correlated from one sighting to the next: the map absorbs
+those, and a larger white noise stands for them.  So there is no such warning where the truth shows that the filter is
+overconfident.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def autocorrelations(history: History) -> list[Window]:
 
 
 def _by_chance(size: Window, variance: Window) -> float:
-    """Return what an autocorrelation may be of white innovations, of the mean sizes and variances of its products."""
+    """Return the limit of the autocorrelation of white innovations, by the mean sizes and variances of its products."""
     return SIGMAS * float(np.sqrt(variance.value / size.number)) / size.value
 
 
@@ -298,7 +298,7 @@ def placements(history: History) -> list[list[RelocatedRobot]]:
 
 
 def words_of(placed: list[RelocatedRobot]) -> str:
-    """Return what readings of one sensor did."""
+    """Return the words for the readings of one sensor."""
     far = ", ".join(figure(one.moved_m, 2) for one in placed[:LISTED]) + " m" + " and so on" * (len(placed) > LISTED)
     return f"readings of {placed[0].sensor} that agree moved {placed[0].robot} by {far}"
 
@@ -420,7 +420,7 @@ def _truth(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def plural(history: History) -> str:
-    """Return what a run's steps end with."""
+    """Return the plural of the events that end a run's steps."""
     return {"fix": "fixes"}.get(history.stepped, f"{history.stepped}s")
 
 

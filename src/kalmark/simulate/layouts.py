@@ -60,7 +60,7 @@ class Scenery:
 
     @property
     def of_space(self) -> bool:
-        """Whether it cannot be in the plane."""
+        """True if it cannot be in the plane."""
         solid = bool(len(self.segments)) and self.segments.shape[1] == 6
         return self.points.shape[1] == 3 or solid or bool(len(self.tags)) or bool(self.planes)
 

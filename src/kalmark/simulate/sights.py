@@ -104,7 +104,7 @@ class SimulatedSensing(Section):
 
     @property
     def has_faults(self) -> bool:
-        """Whether anything but the rate is unusual."""
+        """True if anything but the rate is unusual."""
         return bool(self.dropouts or self.outliers or self.swapped or self.hidden)
 
 

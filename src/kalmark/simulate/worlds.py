@@ -135,7 +135,7 @@ class World(OfFile):
 
     @property
     def has_signatures(self) -> bool:
-        """Whether any sensor measures signatures."""
+        """True if any sensor measures signatures."""
         sensors = [sensor for robot in self.robots.values() for sensor in robot.sensors.values()]
         return any("signature" in model_of(sensor).columns for sensor in sensors)
 

@@ -83,7 +83,7 @@ class Alternative:
 
     @property
     def failed(self) -> bool:
-        """Whether its readings do not fit either."""
+        """True if its readings do not fit either."""
         return self.misses >= NEEDED
 
 

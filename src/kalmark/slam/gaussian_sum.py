@@ -105,12 +105,12 @@ class GaussianSum:
 
     @property
     def shows(self) -> bool:
-        """Whether the map has no filter of its own of the robot."""
+        """True if the map has no filter of its own of the robot."""
         return self.lead == -math.inf
 
     @property
     def is_found(self) -> bool:
-        """Whether its parts explain what was observed better than that it may be any."""
+        """True if its parts explain what was observed better than that it may be any."""
         return _log_sum(self.log_weights) > self.prior_log
 
     def all(self) -> Iterator[Alternative]:

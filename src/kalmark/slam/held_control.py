@@ -73,7 +73,7 @@ class RateMean(NamedTuple):
     number: int
 
     def after(self, rate: Array, sigma: Array) -> RateMean:
-        """Return the mean with one more, of a noise sigma (k,); it begins anew where the control has changed."""
+        """Return the mean with one more, of a noise sigma (k,); it begins again where the control has changed."""
         if (np.abs(rate - self.rate) > CHANGED * sigma * math.sqrt(1.0 + 1.0 / self.number)).any():
             return RateMean(rate, 1)
         number = min(self.number + 1, MOST)
@@ -177,7 +177,7 @@ class HeldInput:
 
     @property
     def is_adrift(self) -> bool:
-        """Whether its pose may be anywhere since a gap."""
+        """True if its pose may be anywhere since a gap."""
         return self.gaps is not None and self.gaps.adrift
 
     def recovered(self) -> None:
@@ -256,7 +256,7 @@ class Moving:
 
     @cached_property
     def moves_itself(self) -> bool:
-        """Whether its diffusion depends on its state."""
+        """True if its diffusion depends on its state."""
         return isinstance(self.motion, StateDiffusion)
 
     @cached_property

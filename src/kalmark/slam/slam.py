@@ -477,7 +477,7 @@ class Slam(Estimate):
         return loaded
 
     def __reduce__(self) -> tuple[Callable[..., Slam], tuple[Any, ...]]:
-        """Return how a copy is made, by `copy` or `pickle`: made anew, with the state that `save` writes."""
+        """Return how a copy is made, by `copy` or `pickle`: made again, with the state that `save` writes."""
         from kalmark.slam import saving
 
         return _copied, ([*self.robots.values()], self.state.settings, saving.members_of(self.state, {}))

@@ -33,7 +33,7 @@ from kalmark.tracks.scan import Start
 from kalmark.tracks.surveys import Surveys
 from kalmark.tracks.track import ChannelKey, Tracks
 
-CURE = "start anew from a pose that is less certain, or with larger sigmas of controls and sensors"
+CURE = "start again from a pose that is less certain, or with larger sigmas of controls and sensors"
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class State:
 
     @property
     def begins(self) -> bool:
-        """Whether a front end still keeps the first frames, which alone are to move the map."""
+        """True if a front end still keeps the first frames, which alone are to move the map."""
         return any(front_end.beginning is not None for front_end in self.front_ends.values())
 
     @property

@@ -19,7 +19,7 @@ from kalmark.tracks.linearity import turn_holds
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.surveys import SURVEYED
 
-ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped anew"
+ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped again"
 WIDER = 2.0  # times what a robot that was elsewhere has moved by
 DOUBLED = 20  # times at most that a robot is moved by one scan, each time farther
 

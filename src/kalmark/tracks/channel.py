@@ -69,7 +69,7 @@ class ObservationModel:
 
     @cached_property
     def built_in(self) -> bool:
-        """Whether sensor and landmark are kalmark's own."""
+        """True if sensor and landmark are kalmark's own."""
         return is_built_in(self.sensor, self.landmark)
 
     @cached_property

@@ -21,7 +21,8 @@ User = tuple[str, str]  # a channel: robot, sensor
 class Measurement:
     """The k-th observation y (m,) of a scan, its noise R (p, p), made from a cloned pose.
 
-    `own_noise`: R was given with the scan; else the sensor's model may give it anew at the position of the landmark.
+    `own_noise`: R was given with the scan; else the sensor's model may compute it again at the position of the
+    landmark.
     """
 
     clone: int
@@ -41,7 +42,7 @@ class Measurement:
 
     @property
     def late(self) -> tuple[int, str, str, int]:
-        """Which observation of the log it is: time, robot, sensor and number in its scan."""
+        """Key of the observation in the log: time, robot, sensor and number in its scan."""
         return self.t_ns, self.robot, self.sensor, self.k
 
 

@@ -27,7 +27,7 @@ UNMEASURED = "its size has not been measured"
 
 
 class Looked(NamedTuple):
-    """Which landmarks (K,) are in view, why the others are not, and of lines and tags the measurements y (K, m)."""
+    """Landmarks (K,) in view, reasons against the others, and of lines and tags the measurements y (K, m)."""
 
     in_view: Flags
     why: list[str]

@@ -6,7 +6,7 @@ expectations are uncertain by together, C = P H'.  A measurement y of one of the
     d <- d + C_i Z^-1 (y - e_i),   C <- C - C_i Z^-1 S_i,   S <- S - S_i' Z^-1 S_i,   Z = S_ii + R.
 
 So a search for landmarks in an image can use what it has found already, without touching the map (Davison 2005).  The
-expectations are projected anew from the mean moved by d: a turn of the camera is not linear over an image.
+expectations are projected again from the mean moved by d: a turn of the camera is not linear over an image.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Belief:
 
     @property
     def pixels(self) -> Array:
-        """Where the landmarks are expected in the image (K, 2)."""
+        """Expected pixels (K, 2) of the landmarks."""
         return self.e[:, :PIXEL]
 
 

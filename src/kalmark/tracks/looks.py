@@ -17,7 +17,7 @@ from kalmark.errors import MapError
 
 MOVED, TURNED_RAD, STANDING = 0.1, 0.2, 20  # of the range; a turn; scans of a sensor that stands: another look
 PER_OCTAVE, NEAREST_LOG2, RANGES, BEARINGS = 4, 8, 80, 24  # of ranges, from 2^-8 m on; sectors of bearings
-AGAIN = 8  # looks until what a miss counts is found anew
+AGAIN = 8  # looks until what a miss counts is estimated again
 CELLS = RANGES + BEARINGS + 2  # the last two: nothing stands nearer, something does
 PARTS = (slice(0, RANGES), slice(RANGES, RANGES + BEARINGS), slice(RANGES + BEARINGS, CELLS))
 MOST = 0.98  # of a detection probability

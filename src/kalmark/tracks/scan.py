@@ -32,7 +32,7 @@ class Start(NamedTuple):
 
     @property
     def is_finite(self) -> bool:
-        """Whether all its numbers are finite."""
+        """True if all its numbers are finite."""
         return all(bool(np.isfinite(a).all()) for a in (self.mean, self.G, self.Q))
 
 
@@ -68,12 +68,12 @@ class ScanContext:
 
     @property
     def own_noise(self) -> bool:
-        """Whether the scan came with its own noise."""
+        """True if the scan came with its own noise."""
         return self.event.cov is not None
 
     @property
     def noise_varies(self) -> bool:
-        """Whether the noise of an observation depends on where its landmark is."""
+        """True if the noise of an observation depends on where its landmark is."""
         return self.channel.noise_at is not None and self.event.cov is None
 
     @property

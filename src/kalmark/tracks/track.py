@@ -279,7 +279,7 @@ class Tracks:
             self.tentative[track.id] = track
 
     def is_invented(self, name: Id) -> bool:
-        """Return whether a landmark's name was invented, for want of an id."""
+        """Return whether a landmark's name was made here, as it has no id."""
         return _looks_invented(name) and name not in self.reserved
 
     # ------------------------------------------------------------------ by channel

@@ -39,7 +39,7 @@ class View:
 
 
 class Looks(NamedTuple):
-    """How K landmarks must look: `templates` (K, s, s), of which those `told` (n,) hold.
+    """Expected appearance of K landmarks: `templates` (K, s, s), of which those `told` (n,) hold.
 
     `likeness` (K, 2) is the cosine of the angle between the directions of view and the scale, of the best view of each.
     `rates` (K, 2, 2, 2): the slopes of the plane move what appears at x from the centre by rates x.
@@ -88,7 +88,7 @@ def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[V
 def predict_templates(
     cv2: Any, views: list[list[View]], planes: list[Plane | None], places: Array, T: Array, sensor: Any, h: int
 ) -> Looks:  # fmt: skip
-    """Return how landmarks at `places` (K, 3) must look from T: templates of half width h."""
+    """Return the expected templates of landmarks at `places` (K, 3) from T, of half width h."""
     best, likeness = best_views(views, places, T)
     templates, done = np.zeros((len(best), 2 * h + 1, 2 * h + 1), np.uint8), []
     rates = np.zeros((len(best), 2, 2, 2))

@@ -2,9 +2,9 @@
 
 While the camera has moved little, its images show products of motion and inverse distance.  Nearly the same images
 result where it moves the other way and what is near is far (Koenderink and van Doorn 1991): a filter, which takes a
-frame at a time and begins with landmarks at one distance, chooses one of the two by the noise of its first frames.
-All first frames together know better.  So they are fitted by least squares from two sides, by the essential matrix of
-the last one (Nister 2004) and by the estimate of the filter, and from the reversed solution of the better one.
+frame at a time and begins with landmarks at one distance, chooses one of the two by the noise of its first frames.  All
+first frames together determine it better.  So they are fitted by least squares from two sides, by the essential matrix
+of the last one (Nister 2004) and by the estimate of the filter, and from the reversed solution of the better one.
 
 The sensor at t, turned by Exp(w), both in the frame of the first image, sees a landmark on the unit ray m at
 
@@ -48,7 +48,7 @@ class Fit(NamedTuple):
 
 @dataclass
 class Beginning:
-    """Keeps the first frames of a sensor until they tell how far the first landmarks are."""
+    """Window of a sensor's first frames, kept until they determine the distances of the first landmarks."""
 
     scans: list[tuple[Scan, list[Id]]] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)  # (7,) of the sensor, by the filter
@@ -63,7 +63,7 @@ class Beginning:
         self.matched.append(fitted)
 
     def tried(self, cv2: Any, sensor: Any, prior: float) -> Begun | None:
-        """Return how the map begins, once that is sure; the median of its inverse distances is the `prior`, 1/m."""
+        """Return the start of the map, once determined; the median of its inverse distances is the `prior`, 1/m."""
         k = len(self.scans) - 1
         if self.over or k < self.next:
             return None

@@ -13,7 +13,7 @@ FORGIVEN = 15  # frames until a cell in which no corner was found is looked at a
 
 
 class Cells:
-    """Cells of an image, `across` of its longer side, shifted anew each time; it remembers where nothing was found."""
+    """Cells of an image, `across` of its longer side, shifted at each use; those without a feature are recorded."""
 
     failed: dict[tuple[int, int], int]
 

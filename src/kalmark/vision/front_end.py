@@ -1,9 +1,9 @@
 """From images to landmarks: a detector that asks where landmarks must appear, and searches only there.  [S] 1.1, 2.4.
 
-For each frame: the expectations of all landmarks in view (`Prospect`), how they must look from there (`appearance`), a
-search that believes what agrees (`selection`), new landmarks in empty cells (`features`).  What is found is a scan with
-ids, which the filter fuses like any other.  What became of it is learnt afterwards: patches of new landmarks and of old
-ones from another side, and which landmarks are not worth their place any more.
+For each frame: the expectations of all landmarks in view (`Prospect`), their expected appearance (`appearance`), a
+search that accepts matches that agree (`selection`), new landmarks in empty cells (`features`).  The matches are a scan
+with ids, which the filter fuses like any other.  The report of the scan then updates patches of new landmarks, and of
+old ones from another side, and removes landmarks that are seldom matched.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ class ActiveSearch:
     """Points of an image, found where the filter expects them: normalised correlation with their patches.
 
     Each frame, `in_view` landmarks are kept in view, at most `starts` new ones from corners with a gradient of at least
-    `contrast` grey values a pixel; a match correlates by `accept` at least.  `keep` says which landmarks stay:
+    `contrast` grey values a pixel; a match correlates by `accept` at least.  `keep` selects the landmarks that stay:
     "global" those that are found in half of the searches for them, the `most` best, "odometry" only those in view.  The
     search begins with a random landmark, by `seed`: the same seed, the same result.
     """
 
     columns: ClassVar[tuple[str, ...]] = PinHole.columns
 
-    in_view: Annotated[Count, "So many landmarks are wanted in view."] = 60
+    in_view: Annotated[Count, "Least number of landmarks in view."] = 60
     starts: Annotated[int, Within(ge=0), "At most so many new ones in a frame."] = 10
     updates: Annotated[Count, "At most so many landmarks are matched in a frame."] = 100
     most: Annotated[Count, "At most so many landmarks in the map: the least useful out of view make room."] = 300
@@ -69,13 +69,13 @@ class ActiveSearch:
     seed: Annotated[int, Within(ge=0), "Of what is chosen at random."] = 0
 
     def front_end(self, sensor: Any) -> FrontEnd:
-        """Return what searches the frames of one sensor."""
+        """Return the search of the frames of one sensor."""
         return FrontEnd(self, sensor)
 
 
 @dataclass
 class Look(Searches):
-    """How a landmark looked, and how often it was searched, found, and fitted."""
+    """Views of a landmark, and its counts of searches, matches and fits."""
 
     views: list[View] = field(default_factory=list)
     plane: Plane | None = None  # about it; none as long as it has no view
@@ -83,7 +83,7 @@ class Look(Searches):
 
 
 class Sighting(NamedTuple):
-    """What a frame showed: a scan, and the landmarks that are given up, each with the reason.
+    """Result of a frame: a scan, and the removed landmarks, each with the reason.
 
     `drifted` are landmarks that have drifted with the sensor, and the factor by which their covariance is too small.
     """
@@ -119,11 +119,11 @@ class FrontEnd:
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "update"), 0.0)
 
     def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Prospect:
-        """Return what the sensor should measure of the landmarks in view, jointly."""
+        """Return the joint expectation of the landmarks in view."""
         return Prospect(map_, tracks, channel, robot)
 
     def recognised(self, image: Any, map_: Map, tracks: Tracks, channel: Channel) -> tuple[Array, Array] | None:
-        """Return where the sensor is (7,), and the covariance (6, 6), if it was lost and has recognised the place."""
+        """Return the pose (7,) of a lost sensor that has recognised the place, and its covariance (6, 6)."""
         known = [name for name, look in self.looks.items() if look.fitted >= TRIAL and look.views]
         if not self.is_lost or len(known) < ENOUGH:
             return None
@@ -180,7 +180,7 @@ class FrontEnd:
         return self.sighting
 
     def update(self, report: Report, T: Array) -> None:
-        """Learn from what became of a frame, its sensor at T (7,) now: patches, and which landmarks fitted."""
+        """Update patches and counts of landmarks by the report of a frame; T (7,) is its sensor's pose now."""
         t0 = perf_counter()
         assert self.prospect is not None
         at = {name: k for k, name in enumerate(self.prospect.names)}
@@ -219,12 +219,12 @@ class FrontEnd:
 
     # ------------------------------------------------------------------ the beginning
     def watch_beginning(self) -> None:
-        """Keep the first frames until they tell how far the first landmarks are: nothing else moves the map."""
+        """Keep the first frames until they determine the first landmarks' distances: nothing else moves the map."""
         if isinstance(self.sensor, PinHole):
             self.beginning = Beginning()
 
     def frames_to_filter_again(self, prior: float) -> Begun | None:
-        """Return, once, how the map begins, as soon as the first frames tell; the median of rho is the `prior`, 1/m."""
+        """Return, once, the start of the map, if the first frames determine it; the median of rho is `prior`, 1/m."""
         if self.beginning is None:
             return None
         found = self.beginning.tried(self.cv2, self.sensor, prior)
@@ -342,7 +342,7 @@ class FrontEnd:
     def _count(self, prospect: Prospect, found: Selection) -> list[tuple[Id, str]]:
         """Count searches; return the landmarks that are given up, each with the reason.
 
-        A frame in which next to nothing is found says nothing of a landmark.
+        A frame with almost no match counts for no landmark.
         """
         removed: list[tuple[Id, str]] = []
         for k in np.flatnonzero(found.searched).tolist() if not self.is_lost else ():

@@ -24,7 +24,7 @@ WIDEST = 0.25  # of the width of the image: disparities that are searched for a 
 
 
 def patches(cv2: Any, image: Any, y: Array, half: int) -> Any:
-    """Return what is about the pixels y (n, 2) of an image, (n, 2 half + 1, 2 half + 1)."""
+    """Return the patches about the pixels y (n, 2) of an image, (n, 2 half + 1, 2 half + 1)."""
     side = 2 * half + 1
     found = [cv2.getRectSubPix(image, (side, side), (float(u), float(v))) for u, v in y]
     return np.array(found, dtype=np.uint8).reshape(-1, side, side)
@@ -69,7 +69,7 @@ def match_pair(
     cv2: Any, images: tuple[Any, Any], y: Array, middle: Array, sigma: Array, sigma_v: float, k: int, half: int,
     accept: float,
 ) -> tuple[Array, Flags]:  # fmt: skip
-    """Return where the right image shows pixels y (n, 2) of the left one, (n, 2), and which it does show (n,).
+    """Return the pixels (n, 2) of the right image that match pixels y (n, 2) of the left one, and which match (n,).
 
     The disparity is searched within three `sigma` (n,) of its `middle` (n,); of all but the first k there and back.
     """

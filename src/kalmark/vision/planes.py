@@ -1,7 +1,7 @@
 """The plane about a landmark, by which its patch is warped.  Molton, Davison and Reid 2004.
 
-A patch is seldom on a plane that faces the camera.  Where what it shows is beside its centre, it then moves against the
-centre as the camera goes round: as if the landmark moved, in each frame anew.  So the plane is estimated,
+A patch is seldom on a plane that faces the camera.  If its content is beside its centre, the content then moves against
+the centre as the camera moves round, as if the landmark moved, in each frame.  So the plane is estimated,
 
     N.(X - p) = 0,  N = m + B s,
 

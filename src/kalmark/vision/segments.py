@@ -2,8 +2,8 @@
 
 Segments are detected in the whole image (LSD, Grompone von Gioi and others 2010), each with the dark side on its left.
 One can be of a line if it lies along the expected segment within the uncertainty of that, the same way round; of those
-the one whose profile of grey values across is alike counts.  The ends of a segment say nothing: an edge may be hidden,
-or break, anywhere.
+the one whose profile of grey values across is alike counts.  The ends of a segment have no information: an edge may be
+hidden, or break, anywhere.
 """
 
 from __future__ import annotations
@@ -48,20 +48,20 @@ class LineSearch:
 
     columns: ClassVar[tuple[str, ...]] = Segments.columns
 
-    in_view: Annotated[Count, "So many lines are wanted in view."] = 20
+    in_view: Annotated[Count, "Least number of lines in view."] = 20
     starts: Annotated[int, Within(ge=0), "At most so many new ones in a frame."] = 5
     min_length_px: Annotated[Positive, "Shortest segment that begins a line."] = 40.0
     most: Annotated[Count, "At most so many lines in the map: the least useful out of view make room."] = 100
     accept: Annotated[float, Within(gt=0, lt=1), "Correlation of the profiles of a match, at least."] = 0.8
 
     def front_end(self, sensor: Any) -> LineFrontEnd:
-        """Return what searches the frames of one sensor."""
+        """Return the search of the frames of one sensor."""
         return LineFrontEnd(self, sensor)
 
 
 @dataclass
 class LineLook(Searches):
-    """How often a line was searched, found and fitted, and its `profile` (2 REACH_PX + 1,) when it last fitted."""
+    """Counts of searches, matches and fits of a line, and its `profile` (2 REACH_PX + 1,) when it last fitted."""
 
     profile: Array | None = None
 
@@ -103,7 +103,7 @@ class LineFrontEnd:
         """Return that lines recognise no place."""
 
     def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Expectations:
-        """Return what the sensor should measure of the lines in view."""
+        """Return the joint expectation of the lines in view."""
         return expectations(map_, tracks, channel, robot, "", only_in_view=True)
 
     def search(self, frame: Frame, image: Any, expected: Expectations, beside: Any = None
@@ -143,7 +143,7 @@ class LineFrontEnd:
         return scan, removed, None
 
     def update(self, report: Report, T: Array) -> None:
-        """Learn from what became of a frame: profiles of new lines, and which lines fitted."""
+        """Update profiles and counts of lines by the report of a frame."""
         t0 = perf_counter()
         assert self.found is not None
         for o in report.observations:

@@ -1,8 +1,8 @@
 """Matches that agree: one-point RANSAC, then active search for the rest.  Civera et al. 2010; Davison 2005.
 
-One match of one landmark, fused into a copy of the mean, says nearly all of how the camera has turned.  Where the
-others then are found within a pixel or two, they agree with it.  What agrees with the best of a few such matches is
-believed together, which leaves small ellipses for the rest: searched in the order of what they would tell.
+One match of one landmark, fused into a copy of the mean, determines nearly all of the camera's rotation.  The others
+agree with it if they are then found within a pixel or two.  The matches that agree with the best of a few such matches
+are accepted together.  The ellipses of the rest are then small; they are searched in the order of information gain.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ ONE_BY_ONE = 3
 
 @dataclass
 class Selection:
-    """What was found of K landmarks: where, y (K, 2), their scores (K,), which were `searched`, which `matched` (K,).
+    """Matches of K landmarks: pixels y (K, 2), scores (K,), flags `searched` and `matched` (K,).
 
-    `belief` is what is believed after them, `centres` (K, 2) and `regions` (K, 2, 2) the ellipses searched, NaN where
+    `belief` is the density after them, `centres` (K, 2) and `regions` (K, 2, 2) the ellipses searched, NaN where
     none was, `base` the landmark on whose match the others agree.  The covariance of the map was too small by `wider`.
     """
 
@@ -57,14 +57,14 @@ class Search:
         )  # fmt: skip
 
     def run(self, random: np.random.Generator) -> Selection:
-        """Return what is found."""
+        """Return the matches."""
         if len(self.told):
             self._consensus(random)
             self._active()
         return self.found
 
     def run_again(self, rows: Index, y: Array) -> Selection:
-        """Return what is found with matches y (n, 2) of some landmarks that were recognised, beside those of the rest.
+        """Return the matches, with those y (n, 2) of some recognised landmarks.
 
         Where they are farther off than expected, in the median, the covariance is too small by as much.
         """
@@ -79,7 +79,7 @@ class Search:
 
     # ------------------------------------------------------------------ one-point RANSAC
     def _consensus(self, random: np.random.Generator) -> None:
-        """Believe the matches that agree with the best of some single ones."""
+        """Accept the matches that agree with the best of some single ones."""
         found, prior = self.found, self.prospect.belief
         best, best_y = np.zeros(0, np.int64), np.zeros((0, 2))
         needed = float(TRIES)
@@ -103,7 +103,7 @@ class Search:
             self._take(best, best_y)
 
     def _agreeing(self, base: int, y: Array) -> tuple[Index, Array]:
-        """Return the landmarks (n,) that are found where the match y (1, 2) of one says that they are, and where."""
+        """Return the landmarks (n,) that are found where the match y (1, 2) of one predicts them, and their pixels."""
         prospect, prior = self.prospect, self.prospect.belief
         e = prospect.expected(prospect.moved(prior, [base], y))[:, :PIXEL]
         others = self.told[self.told != base]
@@ -126,7 +126,7 @@ class Search:
 
     # ------------------------------------------------------------------ active search
     def _active(self) -> None:
-        """Search for the rest, those that tell most first."""
+        """Search for the rest, in the order of their information gain."""
         found = self.found
         found.searched[:] = found.matched  # what did not agree is searched again, in a smaller ellipse
         for _ in range(ONE_BY_ONE):
@@ -151,7 +151,7 @@ class Search:
         return left[order], radii[order]
 
     def _in_ellipses(self, belief: Belief, rows: Index) -> tuple[Array, Flags]:
-        """Return where landmarks are found in their ellipses (n, 2), and which are (n,)."""
+        """Return the pixels (n, 2) of landmarks found in their ellipses, and which are found (n,)."""
         found, Z, e = self.found, self.prospect.innovations(belief, rows), belief.pixels[rows]
         found.searched[rows], found.centres[rows], found.regions[rows] = True, e, Z
         area = math.pi * GATE * np.sqrt(np.maximum(np.linalg.det(Z), 1e-12))

@@ -20,7 +20,7 @@ class Straightened:
 
     @cached_property
     def maps(self) -> tuple[Any, Any]:
-        """Where (H, W) the pixels of the straight image are in that of the camera: u and v."""
+        """Places (H, W) of the pixels of the straight image in that of the camera: u and v."""
         width, height = map(int, self.size)
         v, u = np.mgrid[:height, :width]
         fx, fy, cx, cy = self.intrinsics

@@ -39,7 +39,7 @@ class FirstLook:
             self.corners = fine[np.abs(fine - at).max(axis=1) < APART]
 
     def found(self, belief: Belief, rows: list[int]) -> dict[int, Array]:
-        """Return where landmarks are, pixels (2,) by their rows; none if that is not sure."""
+        """Return the pixels (2,) of landmarks by their rows; none if they are not sure."""
         Z = self.prospect.innovations(belief, np.array(rows, dtype=np.int64))
         order = [rows[k] for k in np.argsort(np.linalg.det(Z), kind="stable")[:AT_ONCE].tolist()]
         trials = []
@@ -55,7 +55,7 @@ class FirstLook:
         return best
 
     def _agreeing(self, belief: Belief, order: list[int], y: Array) -> tuple[dict[int, Array], float]:
-        """Return what is found with the first of some landmarks at y (2,), and the sum of d2, missing ones included."""
+        """Return the matches with the first of some landmarks at y (2,), and the sum of d2, missing ones included."""
         fits: dict[int, Array] = {}
         cost = 0.0
         for k in order:

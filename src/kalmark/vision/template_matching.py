@@ -32,7 +32,7 @@ class Searcher:
         self._half: Any = None
 
     def in_ellipses(self, which: Index, e: Array, Z: Array, d2: float) -> tuple[Array, Array]:
-        """Return where templates `which` (k,) are found in (y - e)' Z^-1 (y - e) <= d2, (k, 2), and their scores (k,).
+        """Return the pixels (k, 2) of templates `which` (k,) in (y - e)' Z^-1 (y - e) <= d2, and scores (k,).
 
         The score of what is not found is below `accept`.
         """
@@ -141,7 +141,7 @@ def best_matches(
 
 @compiled
 def top(image: Any, template: Any, u: int, v: int) -> tuple[float, float]:
-    """Return how far the top of the score is off its greatest value, at (u, v): that of the quadratic fitted to nine.
+    """Return the offset of the maximum of a quadratic, fitted to the nine scores about (u, v), from (u, v).
 
     Nothing where the quadratic has none nearby, or at the border of the image.
     """
@@ -170,7 +170,7 @@ def shift_covariances(image: Any, templates: Any, which: Index, y: Array) -> Arr
     """Return the covariances (k, 2, 2) of least-squares shifts of templates `which` (k,) that were found at y (k, 2).
 
     The image about y is I(x) = g T(x) + o - g T_x t: gain, offset and shift t by least squares over the template, with
-    the variance of what they leave.  Zero where the template is partly outside, or is not of this image at all.
+    the variance of what they leave.  Zero where the template is partly outside, or belongs to another image.
     """
     k, s = len(which), templates.shape[1]
     C, h, row = np.zeros((k, 2, 2)), s // 2, np.empty(4)

@@ -53,7 +53,7 @@ def read(
 
 
 def baseline(file: Path, left: str, right: str) -> float:
-    """Return how far [m] the right camera is to the right of the left one, by their numbers.  Raises LogError."""
+    """Return the baseline [m] from the left to the right camera, by their numbers.  Raises LogError."""
     at = [projection(file, f"P{number}:")[1] for number in (left, right)]
     if not at[1] > at[0]:
         raise LogError(f"{file}: camera {right} is {at[1] - at[0]:g} m to the right of {left}, expected more than 0")

@@ -58,7 +58,7 @@ def read(
 
 
 def published_calibration(name: str) -> dict[str, Any]:
-    """Return the published calibration of a sequence by its name, {} if that does not say which camera took it."""
+    """Return the published calibration of a sequence by its name, {} if the name does not have the camera."""
     series = _SERIES.search(name)
     if series is None:
         return {}

@@ -147,7 +147,7 @@ class FullUpdate:
         self.V[gaps // PANEL, :, gaps % PANEL] = 0.0
         self.panel = self.column = self.row = 0
         self.widths, self.costs = NO_WIDTHS, NO_WIDTHS  # of the tiles of the panel; costs are sums
-        self.aside = PANEL * len(interval.A0) * (len(interval.A) + self.q + GATHERING)  # to know a panel
+        self.aside = PANEL * len(interval.A0) * (len(interval.A) + self.q + GATHERING)  # to update a panel
         cost = PANEL * (self.turns + workspace.share * self.q + TOUCHING)  # of a column of a panel, in multiplications
         self.work = float(sum(cost * min(k + PANEL, self.n) + self.aside for k in panels))
         self.work += WRITING * int(interval.A.sum())
@@ -156,11 +156,11 @@ class FullUpdate:
 
     @property
     def done(self) -> bool:
-        """Whether nothing is left to do."""
+        """True if nothing is left to do."""
         return self.panel * PANEL >= self.n
 
     def advance(self, work: float) -> None:
-        """Do so much work, in multiplications, at least one step; to know a panel is left for later if it is more."""
+        """Do so much work, in multiplications, at least one step; a panel that needs more is updated later."""
         if work <= 0:
             return
         begun, until = self.spent, self.spent + work
@@ -181,7 +181,7 @@ class FullUpdate:
                 self._next_panel()
             return WRITING * last * int((self.where[begin : self.row] >= 0).sum())
         if self.column == 0:
-            if self._know_more(first, last):
+            if self._compute_more(first, last):
                 return self.aside
             self._find_widths()
         begun = self.column // PANEL
@@ -217,17 +217,17 @@ class FullUpdate:
         here = rows < self.n
         unknown = slots[here][~self.known[rows[here]]]
         if len(unknown):
-            self._know(unknown)
+            self._compute(unknown)
 
-    def _know_more(self, first: int, last: int) -> bool:
-        """Know the inactive blocks among the rows first..last; return whether any were unknown."""
+    def _compute_more(self, first: int, last: int) -> bool:
+        """Enter the inactive blocks among the rows first..last; return whether any were missing."""
         slots = np.arange(*np.searchsorted(self.map.blocks[:, P_AT], [first, last]))
         unknown = slots[~self.known[self.map.blocks[slots, P_AT]]]
         if len(unknown):
-            self._know(unknown)
+            self._compute(unknown)
         return len(unknown) > 0
 
-    def _know(self, slots: Index) -> None:
+    def _compute(self, slots: Index) -> None:
         """Work out the means of some blocks, their rows of R = [w, a, W], and their covariances V with A."""
         if not self.rotated:
             self._rotate()

@@ -1,4 +1,4 @@
-"""A compressed map from a file; its tables are built anew from the blocks, so that they fit the arrays."""
+"""A compressed map from a file; its tables are built again from the blocks, so that they fit the arrays."""
 
 from __future__ import annotations
 
