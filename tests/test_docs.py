@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import inspect
 import json
 import os
@@ -12,12 +13,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import api_pages
 import figures
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 
+import kalmark as km
 from kalmark.cli.app import app
-from kalmark.declare import built_in, is_own, world_of_class
+from kalmark.declare import built_in, is_own, registered_name, world_of_class
 from kalmark.logs import known_formats
 
 ROOT = Path(__file__).parent.parent
@@ -56,6 +60,32 @@ def test_a_lesson_runs_and_is_short(lesson: Path, tmp_path: Path, monkeypatch: p
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(lesson))
     plt.close("all")
+
+
+EXAMPLES = {
+    f"{shown}.{name}": (module, thing)
+    for _, shown, module in api_pages.PARTS
+    for name, thing in api_pages.public_names(module).items()
+}
+
+
+@pytest.mark.parametrize("name", [name for name, (_, thing) in EXAMPLES.items() if ">>>" in (thing.__doc__ or "")])
+def test_an_example_of_a_docstring_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    module, thing = EXAMPLES[name]
+    names = {**api_pages.public_names(module), "km": km, "np": np}
+    example = doctest.DocTestParser().get_doctest(inspect.getdoc(thing), names, name, None, 0)
+    told: list[str] = []
+    assert doctest.DocTestRunner(verbose=False).run(example, out=told.append).failed == 0, "".join(told)
+
+
+def test_every_public_function_of_geometry_has_an_example_and_every_model_can_be_made_as_its_page_says() -> None:
+    for name, (module, thing) in EXAMPLES.items():
+        if module.startswith("kalmark.geometry") and callable(thing):
+            assert ">>>" in thing.__doc__, name
+        elif registered_name(thing) if isinstance(thing, type) else None:
+            call = re.search(r"^   (km\..*\))$", api_pages.page_of_name("", name.rpartition(".")[2], thing), re.M)
+            assert isinstance(eval(call[1], {"km": km}), thing), name
 
 
 def test_pages_call_kalmark_and_python_as_the_readme_says_once_the_environment_is_active() -> None:

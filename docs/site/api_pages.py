@@ -5,7 +5,6 @@ configuration follow from the declaration.
 """
 
 import inspect
-import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -57,12 +56,11 @@ def write(folder: Path) -> None:
     """Write all pages that differ, and remove those of names that are gone."""
     pages = {"index": _index()}
     for _, shown, name in PARTS:
-        module = import_module(name)
-        names = {one: _page(shown, one, getattr(module, one)) for one in module.__all__}
-        names = {one: page for one, page in names.items() if not inspect.ismodule(getattr(module, one))}
-        pages[shown] = _module(shown, module, names)
+        named = {one: (_page(shown, one, thing), thing) for one, thing in public_names(name).items()}
+        names = {one: page for one, (page, _) in named.items()}
+        pages[shown] = _module(shown, import_module(name), names)
         pages |= {
-            page: _name(shown, one, getattr(module, one)) for one, page in names.items() if page.startswith(f"{shown}.")
+            page: page_of_name(shown, one, thing) for one, (page, thing) in named.items() if page == f"{shown}.{one}"
         }
     folder.mkdir(exist_ok=True)
     for old in {*folder.glob("*.rst")} - {folder / f"{page}.rst" for page in pages}:
@@ -71,6 +69,12 @@ def write(folder: Path) -> None:
         file = folder / f"{page}.rst"
         if not file.exists() or file.read_text() != text:
             file.write_text(text)
+
+
+def public_names(module: str) -> dict[str, Any]:
+    """Return the names that a module lists, without modules."""
+    things = {name: getattr(import_module(module), name) for name in import_module(module).__all__}
+    return {name: thing for name, thing in things.items() if not inspect.ismodule(thing)}
 
 
 def _page(shown: str, name: str, thing: Any) -> str:
@@ -144,7 +148,8 @@ def _summary(thing: Any) -> str:
     return text.partition(".  ")[0].rstrip(".") + "." if text else ""
 
 
-def _name(shown: str, name: str, thing: Any) -> str:
+def page_of_name(shown: str, name: str, thing: Any) -> str:
+    """Return the page of a name that a module `shown` has."""
     parts = [
         _head(name),
         f".. py:currentmodule:: {shown.replace('km', 'kalmark', 1) if shown.startswith('km.') else shown}",
@@ -195,7 +200,7 @@ def _model(name: str, thing: Any, named: str) -> list[str]:
     facts = "; ".join(filter(None, [f"{what}: {columns}" if columns else "", where]))
     declared = [each for each in parameters(thing) if each.text]
     some = [p for p in declared if isinstance(p.default, int | float) and p.default != float("inf")][:2]
-    home = next((shown for _, shown, module in PARTS if getattr(sys.modules[module], name, None) is thing), "km")
+    home = next((shown for _, shown, module in PARTS if getattr(import_module(module), name, None) is thing), "km")
     keys = "".join(f", {p.name}: {str(p.default).lower() if isinstance(p.default, bool) else p.default}" for p in some)
     told = [facts[:1].upper() + facts[1:] + "." if facts else "", "", ".. code-block:: python", ""]
     call = f"{home.replace('kalmark', 'km', 1)}.{name}({', '.join(f'{p.name}={p.default!r}' for p in some)})"

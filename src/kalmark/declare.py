@@ -61,7 +61,11 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Within:
-    """The bounds of a number, or of each number of a list; without `infinite` it is finite."""
+    """The bounds of a number, or of each number of a list; without `infinite` it is finite.
+
+    >>> Within(gt=0).holds(0.0)
+    False
+    """
 
     ge: float | None = None
     gt: float | None = None
@@ -189,7 +193,11 @@ def unit_of(name: str) -> str:
 
 
 def parameters(model: type) -> tuple[Parameter, ...]:
-    """Return the parameters of a model's class, () if it is no dataclass."""
+    """Return the parameters of a model's class, () if it is no dataclass.
+
+    >>> [one.name for one in parameters(km.sensors.Bearing)][:2]
+    ['sigma_bearing_rad', 'range_min_m']
+    """
     return _parameters(model)
 
 

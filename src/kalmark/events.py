@@ -236,6 +236,9 @@ class Control(_Timed):
     `u` has the motion model's shape and units; `cov` (same size, squared) overrides the model's own noise.
     `share` is less than 1 for a part of an increment, whose noise is that share of the whole one's, `cov` or the
     model's, and the variances `uneven` (k,) besides.  `largest` is the largest magnitude in `u`.
+
+    >>> km.Control(t_s=0.5, robot="rover", u=(0.5, 0.02)).t_ns
+    500000000
     """
 
     t_ns: int
@@ -281,6 +284,9 @@ class Scan(_Timed):
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
     overrides the noise of the sensor model.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
     `width` is the m it was given, 0 for (), `largest` the largest magnitude in `y`.
+
+    >>> km.Scan(t_s=0.5, robot="rover", sensor="lidar", y=[[4.2, 0.3], [2.0, -0.1]], ids=[7, None]).ids
+    (7, None)
     """
 
     t_ns: int
@@ -323,7 +329,11 @@ class Scan(_Timed):
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
 class Fix(_Timed):
-    """An absolute position of a robot, `y` = (x, y[, z]) in metres in the map's frame, with covariance `cov`."""
+    """An absolute position of a robot, `y` = (x, y[, z]) in metres in the map's frame, with covariance `cov`.
+
+    >>> km.Fix(t_s=0.5, robot="rover", y=(1.0, 2.0), cov=np.diag([0.04, 0.04])).y
+    array([1., 2.])
+    """
 
     t_ns: int
     robot: str
@@ -354,6 +364,9 @@ class Frame(_Timed):
     that of the right camera of a rectified pair, of which `image` is the left one, and `depth` (H, W) in m, 0 where
     there is none, are arrays, or functions that read them each time they are needed: a log of many frames holds no
     pixel.
+
+    >>> km.Frame(t_s=0.5, robot="rover", sensor="camera", image=np.zeros((480, 640), np.uint8)).image.shape
+    (480, 640)
     """
 
     t_ns: int

@@ -197,6 +197,11 @@ class Report:
     `repeats` were found in the map after the scan, and not merged.
     `replaced` is the distance in m by which a robot was moved to the position of the last fixes, which had not fitted.
     `standing` is the reading of zero velocity that was added to the event, of a robot that was detected to stand.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> report = km.Slam(rover).process(km.Scan(t_s=0.1, robot="rover", sensor="lidar", y=[[4.2, 0.3]], ids=[7]))
+    >>> [(one.landmark, one.outcome) for one in report.observations]
+    [(7, 'new')]
     """
 
     __slots__ = (

@@ -45,6 +45,13 @@ def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
 
     Without a log the robots are those that the configuration names; `each` alone is one robot called "robot".  What is
     `given`, arguments of `Slam`, stands in the place of what is configured.
+
+    >>> from kalmark.config import build_slam
+    >>> from kalmark.simulate import load_world, simulate
+    >>> world = load_world("cloister", ["steps=100"])
+    >>> log = simulate(world)
+    >>> build_slam(world.config(), log)
+    <Slam of 'robot' before its first event: 0 landmarks, Invariant, ByIdentity>
     """
     config = config if log is None else with_log_description(config, log)
     robots = given.pop("robots", None) or [build_robot(config, name, log) for name in _names(config, log)]
@@ -96,7 +103,12 @@ def slam_described(said: dict[str, Any], **given: Any) -> Slam:
 
 
 def config_dict(config: Config) -> dict[str, Any]:
-    """Return everything in force as plain values, to be saved as ``config.yaml`` and loaded again."""
+    """Return everything in force as plain values, to be saved as ``config.yaml`` and loaded again.
+
+    >>> from kalmark.config import config_dict, load_config
+    >>> config_dict(load_config("native"))["estimator"]["type"]
+    'invariant'
+    """
     content = _plain(config)
     return {"version": version("kalmark"), "seed": config.seed} | {
         key: value for key, value in content.items() if key not in ("version", "seed")

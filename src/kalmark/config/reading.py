@@ -40,6 +40,10 @@ def load_config(path_or_name: str | Path, overrides: Sequence[str] = ()) -> Conf
     """Return the configuration at a path or of a shipped name, with overrides like ``log.path=my_log`` applied.
 
     Raises ConfigError: ``file:line:column: key.path: got value, expected what``.
+
+    >>> from kalmark.config import load_config
+    >>> load_config("native", ["association.type=auto"]).association.type
+    'auto'
     """
     path = resolve_config(path_or_name)
     return config_of(read_tree(path, overrides), path)
@@ -72,12 +76,22 @@ def run_plugins(tree: Tree, path: Path | None) -> None:
 
 
 def shipped_configs(folder: str = "configs") -> dict[str, Path]:
-    """Return the configurations that come with kalmark, by name, or what another folder of it has."""
+    """Return the configurations that come with kalmark, by name, or what another folder of it has.
+
+    >>> from kalmark.config import shipped_configs
+    >>> "native" in shipped_configs()
+    True
+    """
     return {path.stem: path for path in sorted((Path(str(resources.files("kalmark"))) / folder).glob("*.yaml"))}
 
 
 def resolve_config(path_or_name: str | Path) -> Path:
-    """Return the file of a path or shipped name; a missing ``anywhere/mrclam.yaml`` is the shipped `mrclam`."""
+    """Return the file of a path or shipped name; a missing ``anywhere/mrclam.yaml`` is the shipped `mrclam`.
+
+    >>> from kalmark.config import resolve_config
+    >>> resolve_config("native").name
+    'native.yaml'
+    """
     return resolve_name(path_or_name, shipped_configs(), "configuration")
 
 

@@ -17,7 +17,10 @@ __all__ = ["TextbookSlam"]
 
 
 class TextbookSlam:
-    """One robot with a range-bearing sensor at its centre and points: x = (robot, landmarks), P their covariance."""
+    """One robot with a range-bearing sensor at its centre and points: x = (robot, landmarks), P their covariance.
+
+    >>> slam = TextbookSlam(start=[0, 0, 0], Q=np.diag([0.1, 0.05]) ** 2, R=np.diag([0.1, 0.02]) ** 2)
+    """
 
     def __init__(self, start: Any, Q: Any, R: Any, P: Any = None) -> None:
         """Start at the pose `start` with covariance P; Q (2, 2) is the noise of (forward, turn), R (2, 2) of (r, b)."""

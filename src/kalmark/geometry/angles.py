@@ -13,13 +13,22 @@ from kalmark.compiled import compiled
 
 @compiled
 def wrap(a: Any) -> Any:
-    """Return the angle (rad; a number or an array) brought into (-pi, pi]."""
+    """Return the angle (rad; a number or an array) brought into (-pi, pi].
+
+    >>> km.geometry.wrap(4.0)
+    -2.2831853071795862
+    """
     return a - 2 * np.pi * np.ceil((a - np.pi) / (2 * np.pi))
 
 
 @compiled
 def rotation(a: float) -> Array:
-    """Return the rotation matrix (2, 2) of an angle.  [S] (54)."""
+    """Return the rotation matrix (2, 2) of an angle.  [S] (54).
+
+    >>> km.geometry.rotation(np.pi / 2).round(3)
+    array([[ 0., -1.],
+           [ 1.,  0.]])
+    """
     c, s = math.cos(a), math.sin(a)
     return np.array([[c, -s], [s, c]])
 
@@ -44,12 +53,22 @@ def exponential_v_rate(a: float) -> tuple[float, float]:
 
 
 def V(a: float) -> Array:
-    """Return V(a) (2, 2), which carries a twist's translation along a turn by `a` rad."""
+    """Return V(a) (2, 2), which carries a twist's translation along a turn by `a` rad.
+
+    >>> km.geometry.V(0.2).round(3)
+    array([[ 0.993, -0.1  ],
+           [ 0.1  ,  0.993]])
+    """
     p, q = exponential_v(a)
     return np.array([[p, -q], [q, p]])
 
 
 def V_inverse(a: float) -> Array:
-    """Return the inverse of V(a), shape (2, 2)."""
+    """Return the inverse of V(a), shape (2, 2).
+
+    >>> (km.geometry.V_inverse(0.2) @ km.geometry.V(0.2)).round(3)
+    array([[ 1., -0.],
+           [ 0.,  1.]])
+    """
     p, q = exponential_v(a)
     return np.array([[p, q], [-q, p]]) / (p * p + q * q)

@@ -18,7 +18,11 @@ __all__ = ["direction_many", "inv_spherical_many", "spherical_many", "unit_many"
 
 @compiled
 def unit_many(v: Array) -> tuple[Array, Array]:
-    """Return the unit vectors m along v (K, 3), and M_v (K, 3, 3) = (I - m m') / |v|."""
+    """Return the unit vectors m along v (K, 3), and M_v (K, 3, 3) = (I - m m') / |v|.
+
+    >>> km.geometry.directions.unit_many(np.array([[3.0, 0.0, 4.0]]))[0].round(3)
+    array([[0.6, 0. , 0.8]])
+    """
     k = len(v)
     m, M_v = np.empty((k, 3)), np.empty((k, 3, 3))
     for i in range(k):
@@ -33,7 +37,11 @@ def unit_many(v: Array) -> tuple[Array, Array]:
 
 @compiled
 def direction_many(a: Array) -> tuple[Array, Array]:
-    """Return the unit vectors m (K, 3) of azimuths and elevations a (K, 2), rad, and M_a (K, 3, 2)."""
+    """Return the unit vectors m (K, 3) of azimuths and elevations a (K, 2), rad, and M_a (K, 3, 2).
+
+    >>> km.geometry.directions.direction_many(np.array([[np.pi / 2, 0.0]]))[0].round(3)
+    array([[0., 1., 0.]])
+    """
     k = len(a)
     m, M_a = np.empty((k, 3)), np.zeros((k, 3, 2))
     for i in range(k):
@@ -46,7 +54,11 @@ def direction_many(a: Array) -> tuple[Array, Array]:
 
 @compiled
 def spherical_many(p: Array) -> tuple[Array, Array]:
-    """Measure range (m), azimuth, elevation (rad) of points p (K, 3): y (K, 3), Y_p (K, 3, 3).  [S] (61) in space."""
+    """Measure range (m), azimuth, elevation (rad) of points p (K, 3): y (K, 3), Y_p (K, 3, 3).  [S] (61) in space.
+
+    >>> km.geometry.directions.spherical_many(np.array([[3.0, 0.0, 4.0]]))[0].round(3)
+    array([[5.   , 0.   , 0.927]])
+    """
     k = len(p)
     y, Y_p = np.empty((k, 3)), np.empty((k, 3, 3))
     for i in range(k):
@@ -63,7 +75,11 @@ def spherical_many(p: Array) -> tuple[Array, Array]:
 
 @compiled
 def inv_spherical_many(y: Array) -> tuple[Array, Array]:
-    """Return the points p (K, 3) at ranges, azimuths and elevations y (K, 3), and P_y (K, 3, 3).  [S] (62) in space."""
+    """Return the points p (K, 3) at ranges, azimuths and elevations y (K, 3), and P_y (K, 3, 3).  [S] (62) in space.
+
+    >>> km.geometry.directions.inv_spherical_many(np.array([[5.0, 0.0, 0.0]]))[0].round(3)
+    array([[5., 0., 0.]])
+    """
     m, M_a = direction_many(y[:, 1:])
     p, P_y = np.empty_like(m), np.empty((len(y), 3, 3))
     for i in range(len(y)):

@@ -19,7 +19,12 @@ from kalmark.geometry.angles import wrap
 
 @compiled
 def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Return c = a o b (frame b given in frame a), C_a (3, 3) and C_b (3, 3).  [S] (55)."""
+    """Return c = a o b (frame b given in frame a), C_a (3, 3) and C_b (3, 3).  [S] (55).
+
+    >>> c, C_a, C_b = km.geometry.compose(np.array([1.0, 2.0, np.pi / 2]), np.array([1.0, 0.0, 0.0]))
+    >>> c.round(3)
+    array([1.   , 3.   , 1.571])
+    """
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x, y = cos * b[0] - sin * b[1], sin * b[0] + cos * b[1]
     c, C_a, C_b = np.empty(3), np.eye(3), np.eye(3)
@@ -31,7 +36,12 @@ def compose(a: Array, b: Array) -> tuple[Array, Array, Array]:
 
 @compiled
 def inverse(a: Array) -> tuple[Array, Array]:
-    """Return the inverse frame b, with b o a = 0, and B_a (3, 3)."""
+    """Return the inverse frame b, with b o a = 0, and B_a (3, 3).
+
+    >>> b, B_a = km.geometry.inverse(np.array([1.0, 2.0, np.pi / 2]))
+    >>> b.round(3)
+    array([-2.   ,  1.   , -1.571])
+    """
     cos, sin = math.cos(a[2]), math.sin(a[2])
     x, y = -cos * a[0] - sin * a[1], sin * a[0] - cos * a[1]
     return np.array([x, y, wrap(-a[2])]), np.array([[-cos, -sin, y], [sin, -cos, -x], [0.0, 0.0, -1.0]])
@@ -105,22 +115,42 @@ def one_or_many(function: Callable[..., tuple[Array, ...]], *given: Any) -> Any:
 
 
 def to_frame(f: Any, p: Any) -> tuple[Array, Array, Array]:
-    """Express global points p (2,) or (K, 2) in frame F: pf, PF_f, PF_p.  [S] (56)."""
+    """Express global points p (2,) or (K, 2) in frame F: pf, PF_f, PF_p.  [S] (56).
+
+    >>> pf, PF_f, PF_p = km.geometry.to_frame([1.0, 2.0, np.pi / 2], [1.0, 5.0])
+    >>> pf.round(3)
+    array([3., 0.])
+    """
     return one_or_many(to_frame_many, f, p)
 
 
 def from_frame(f: Any, pf: Any) -> tuple[Array, Array, Array]:
-    """Express points pf (2,) or (K, 2) of frame F globally: pw, PW_f, PW_pf.  [S] (55)."""
+    """Express points pf (2,) or (K, 2) of frame F globally: pw, PW_f, PW_pf.  [S] (55).
+
+    >>> pw, PW_f, PW_pf = km.geometry.from_frame([1.0, 2.0, np.pi / 2], [3.0, 0.0])
+    >>> pw.round(3)
+    array([1., 5.])
+    """
     return one_or_many(from_frame_many, f, pf)
 
 
 def scan(p: Any) -> tuple[Array, Array]:
-    """Measure range (m) and bearing (rad) of points (2,) or (K, 2) of the sensor's frame: y, Y_p.  [S] (61)."""
+    """Measure range (m) and bearing (rad) of points (2,) or (K, 2) of the sensor's frame: y, Y_p.  [S] (61).
+
+    >>> y, Y_p = km.geometry.scan([3.0, 4.0])
+    >>> y.round(3)
+    array([5.   , 0.927])
+    """
     return one_or_many(scan_many, p)
 
 
 def inv_scan(y: Any) -> tuple[Array, Array]:
-    """Turn ranges and bearings (2,) or (K, 2) into points of the sensor's frame: p, P_y.  [S] (62)."""
+    """Turn ranges and bearings (2,) or (K, 2) into points of the sensor's frame: p, P_y.  [S] (62).
+
+    >>> p, P_y = km.geometry.inv_scan([5.0, 0.0])
+    >>> p.round(3)
+    array([5., 0.])
+    """
     return one_or_many(inv_scan_many, y)
 
 
@@ -128,6 +158,11 @@ def observe(r: Any, p: Any) -> tuple[Array, Array, Array]:
     """Measure range and bearing y (K, 2) of global points p (K, 2) from robot r (3,).  [S] (63), C.2.2.
 
     Returns y, Y_r (K, 2, 3) and Y_p (K, 2, 2); one point (2,) is measured without the leading dimension.
+
+    >>> y, Y_r, Y_p = km.geometry.observe([0.0, 0.0, np.pi / 2], [[3.0, 4.0], [0.0, 2.0]])
+    >>> y.round(3)
+    array([[ 5.   , -0.644],
+           [ 2.   ,  0.   ]])
     """
     pr, PR_r, PR_p = to_frame(r, p)
     y, Y_pr = scan(pr)
@@ -138,6 +173,10 @@ def inv_observe(r: Any, y: Any) -> tuple[Array, Array, Array]:
     """Return the global points p (K, 2) that robot r (3,) observes at ranges and bearings y (K, 2).  [S] (64), C.2.3.
 
     Returns p, P_r (K, 2, 3) and P_y (K, 2, 2); one measurement (2,) gives them without the leading dimension.
+
+    >>> p, P_r, P_y = km.geometry.inv_observe([1.0, 2.0, np.pi / 2], [3.0, 0.0])
+    >>> p.round(3)
+    array([1., 5.])
     """
     pr, PR_y = inv_scan(y)
     p, P_r, P_pr = from_frame(r, pr)
@@ -145,7 +184,12 @@ def inv_observe(r: Any, y: Any) -> tuple[Array, Array, Array]:
 
 
 def move(r: Any, u: Any, n: Any) -> tuple[Array, Array, Array]:
-    """Move robot r by u + n = (forward, turn), forward along the old heading: ro, RO_r, RO_n (3, 2).  [S] (59)-(60)."""
+    """Move robot r by u + n = (forward, turn), forward along the old heading: ro, RO_r, RO_n (3, 2).  [S] (59)-(60).
+
+    >>> r, R_r, R_n = km.geometry.move([0.0, 0.0, np.pi / 2], [1.0, 0.1], [0.0, 0.0])
+    >>> r.round(3)
+    array([0.   , 1.   , 1.671])
+    """
     forward, turn = np.asarray(u, dtype=np.float64) + np.asarray(n, dtype=np.float64)
     ro, RO_r, RO_d = compose(np.ascontiguousarray(r, dtype=np.float64), np.array([forward, 0.0, turn]))
     return ro, RO_r, RO_d[:, [0, 2]]

@@ -17,7 +17,15 @@ from kalmark.geometry.frames import compose, inverse
 
 
 def ellipse(mean: Any, cov: Any, sigmas: float = 1.0, points: int = 16) -> Array:
-    """Return the n-sigma contour of a 2-D Gaussian as (points + 1, 2), closed.  [S] (85)-(87), `cov2elli`."""
+    """Return the n-sigma contour of a 2-D Gaussian as (points + 1, 2), closed.  [S] (85)-(87), `cov2elli`.
+
+    >>> km.geometry.ellipse([0.0, 0.0], np.diag([4.0, 1.0]), sigmas=3, points=4).round(3) + 0.0
+    array([[ 6.,  0.],
+           [ 0.,  3.],
+           [-6.,  0.],
+           [ 0., -3.],
+           [ 6.,  0.]])
+    """
     axes, d2, _ = np.linalg.svd(np.asarray(cov, dtype=np.float64))
     alpha = 2 * np.pi / points * np.arange(points + 1)
     circle = np.stack([np.cos(alpha), np.sin(alpha)])
@@ -35,7 +43,11 @@ def ellipses(means: Array, covs: Array, sigmas: float = 1.0, points: int = 16) -
 
 
 def mahalanobis(x: Any, mean: Any, cov: Any) -> float:
-    """Return the Mahalanobis distance (not its square) of x from a Gaussian.  [S] (83)."""
+    """Return the Mahalanobis distance (not its square) of x from a Gaussian.  [S] (83).
+
+    >>> round(km.geometry.mahalanobis([2.0, 0.0], [0.0, 0.0], np.diag([4.0, 1.0])), 3)
+    1.0
+    """
     d = np.asarray(x, dtype=np.float64) - np.asarray(mean, dtype=np.float64)
     return float(np.sqrt(d @ np.linalg.solve(np.asarray(cov, dtype=np.float64), d)))
 
@@ -44,6 +56,9 @@ def bhattacharyya(a: Any, A: Any, b: Any, B: Any) -> float:
     """Return the Bhattacharyya distance between two Gaussians (n,): how far apart they are, and how unlike.  [T] 2.
 
     (a - b)' (A + B)^-1 (a - b) / 4 + log(det((A + B) / 2) / sqrt(det A det B)) / 2.
+
+    >>> float(np.round(km.geometry.bhattacharyya([2.0], [[1.0]], [0.0], [[1.0]]), 3))
+    0.5
     """
     A, B = np.asarray(A, dtype=np.float64), np.asarray(B, dtype=np.float64)
     d = np.asarray(a, dtype=np.float64) - np.asarray(b, dtype=np.float64)
@@ -61,24 +76,43 @@ def quantile(probability: Any, dof: Any) -> Any:
 
 @lru_cache(maxsize=256)
 def gate(probability: float, dof: int) -> float:
-    """Return the squared Mahalanobis distance within which a Gaussian of `dof` dimensions lies so often."""
+    """Return the squared Mahalanobis distance within which a Gaussian of `dof` dimensions lies so often.
+
+    >>> round(km.geometry.gate(0.95, dof=2), 3)
+    5.991
+    """
     return float(quantile(probability, dof))
 
 
 def sigma_probability(sigmas: float, dof: int) -> float:
-    """Return how often a Gaussian of `dof` dimensions lies inside its n-sigma ellipsoid.  [S] Table 3."""
+    """Return how often a Gaussian of `dof` dimensions lies inside its n-sigma ellipsoid.  [S] Table 3.
+
+    >>> round(km.geometry.sigma_probability(3.0, dof=2), 4)
+    0.9889
+    """
     from scipy.special import chdtr
 
     return float(chdtr(dof, sigmas**2))
 
 
 def sigma_table(sigmas: tuple[float, ...] = (1, 2, 3, 4), dofs: tuple[int, ...] = (2, 3)) -> Array:
-    """Return the probabilities (D, S) of [S] Table 3 for D dimensions and S numbers of sigmas."""
+    """Return the probabilities (D, S) of [S] Table 3 for D dimensions and S numbers of sigmas.
+
+    >>> km.geometry.sigma_table().round(3)
+    array([[0.393, 0.865, 0.989, 1.   ],
+           [0.199, 0.739, 0.971, 0.999]])
+    """
     return np.array([[sigma_probability(n, dof) for n in sigmas] for dof in dofs])
 
 
 def compound(a: Any, A: Any, b: Any, B: Any) -> tuple[Array, Array]:
-    """Compound two uncertain transforms in series: c = a o b with covariance C (3, 3).  [T] 2 (i)."""
+    """Compound two uncertain transforms in series: c = a o b with covariance C (3, 3).  [T] 2 (i).
+
+    >>> a, A = [1.0, 2.0, np.pi / 2], np.diag([0.01, 0.01, 0.0025])
+    >>> c, C = km.geometry.compound(a, A, [1.0, 0.0, 0.0], A)
+    >>> np.diag(C).round(4)
+    array([0.0225, 0.02  , 0.005 ])
+    """
     c, c_a, c_b = compose(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     return c, c_a @ np.asarray(A) @ c_a.T + c_b @ np.asarray(B) @ c_b.T
 
@@ -87,6 +121,10 @@ def merge(a: Any, A: Any, b: Any, B: Any) -> tuple[Array, Array]:
     """Merge two independent estimates of one frame (3,) or point (2,), in parallel.  [T] 2 (ii).
 
     A third component is an angle; the difference is wrapped before it is weighed.
+
+    >>> m, M = km.geometry.merge([1.0, 0.0], np.eye(2), [2.0, 0.0], np.eye(2))
+    >>> m.round(3), np.diag(M).round(3)
+    (array([1.5, 0. ]), array([0.5, 0.5]))
     """
     a, A, B = (np.asarray(m, dtype=np.float64) for m in (a, A, B))
     z = np.asarray(b, dtype=np.float64) - a
@@ -101,7 +139,12 @@ def merge(a: Any, A: Any, b: Any, B: Any) -> tuple[Array, Array]:
 
 
 def relative_frame(a: Any, b: Any) -> tuple[Array, Array, Array]:
-    """Return the frame b as seen from the frame a, c = a^-1 o b (3,), with C_a and C_b (3, 3)."""
+    """Return the frame b as seen from the frame a, c = a^-1 o b (3,), with C_a and C_b (3, 3).
+
+    >>> c, C_a, C_b = km.geometry.relative_frame([1.0, 2.0, np.pi / 2], [1.0, 3.0, np.pi / 2])
+    >>> c.round(3)
+    array([1., 0., 0.])
+    """
     back, A_a = inverse(np.array(a, dtype=np.float64))
     c, C_back, C_b = compose(back, np.array(b, dtype=np.float64))
     return c, C_back @ A_a, C_b
@@ -111,6 +154,10 @@ def intersection(a: Any, b: Any) -> tuple[Array, Array, Array]:
     """Return where two rays meet, p (..., 2), with P_a and P_b (..., 2, 3).  [T] 2.
 
     A ray is a frame (..., 3) and runs along its x axis; p is NaN where they do not meet ahead of both.
+
+    >>> p, P_a, P_b = km.geometry.intersection([0.0, 0.0, 0.0], [2.0, -1.0, np.pi / 2])
+    >>> p.round(3)
+    array([2., 0.])
     """
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     u_a, u_b = (np.stack([np.cos(r[..., 2]), np.sin(r[..., 2])], axis=-1) for r in (a, b))

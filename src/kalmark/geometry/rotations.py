@@ -24,19 +24,34 @@ __all__ = [
 
 @compiled
 def skew(v: Array) -> Array:
-    """Return [v]x (3, 3), with [v]x w = v x w."""
+    """Return [v]x (3, 3), with [v]x w = v x w.
+
+    >>> km.geometry.rotations.skew(np.array([1.0, 2.0, 3.0]))
+    array([[ 0., -3.,  2.],
+           [ 3.,  0., -1.],
+           [-2.,  1.,  0.]])
+    """
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 @compiled
 def normalize(q: Array) -> Array:
-    """Return q (4,) divided by its norm."""
+    """Return q (4,) divided by its norm.
+
+    >>> km.geometry.rotations.normalize(np.array([0.0, 0.0, 0.0, 2.0]))
+    array([0., 0., 0., 1.])
+    """
     return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
 
 
 @compiled
 def multiply(a: Array, b: Array) -> Array:
-    """Return the normalised product (4,) of two unit quaternions a, b (4,): the rotation b, then a."""
+    """Return the normalised product (4,) of two unit quaternions a, b (4,): the rotation b, then a.
+
+    >>> q = km.geometry.rotations.exp(np.array([0.0, 0.0, 0.2]))
+    >>> km.geometry.rotations.log(km.geometry.rotations.multiply(q, q)).round(3)
+    array([0. , 0. , 0.4])
+    """
     return normalize(
         np.array(
             [
@@ -51,13 +66,23 @@ def multiply(a: Array, b: Array) -> Array:
 
 @compiled
 def conjugate(q: Array) -> Array:
-    """Return the inverse (4,) of a unit quaternion q (4,)."""
+    """Return the inverse (4,) of a unit quaternion q (4,).
+
+    >>> km.geometry.rotations.conjugate(np.array([0.0, 0.0, 0.6, 0.8]))
+    array([-0. , -0. , -0.6,  0.8])
+    """
     return np.array([-q[0], -q[1], -q[2], q[3]])
 
 
 @compiled
 def matrix(q: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a unit quaternion (4,)."""
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,).
+
+    >>> km.geometry.rotations.matrix(np.array([0.0, 0.0, 1.0, 0.0]))
+    array([[-1.,  0.,  0.],
+           [ 0., -1.,  0.],
+           [ 0.,  0.,  1.]])
+    """
     x, y, z, w = q[0], q[1], q[2], q[3]
     return np.array(
         [
@@ -70,7 +95,11 @@ def matrix(q: Array) -> Array:
 
 @compiled
 def from_matrix(Q: Array) -> Array:
-    """Return the unit quaternion, w >= 0, of a rotation matrix (3, 3); divides by its largest component."""
+    """Return the unit quaternion, w >= 0, of a rotation matrix (3, 3); divides by its largest component.
+
+    >>> km.geometry.rotations.from_matrix(np.diag([-1.0, -1.0, 1.0]))
+    array([0., 0., 1., 0.])
+    """
     trace = Q[0, 0] + Q[1, 1] + Q[2, 2]
     q = np.empty(4)
     if trace > max(Q[0, 0], Q[1, 1], Q[2, 2]):
@@ -90,7 +119,11 @@ def from_matrix(Q: Array) -> Array:
 
 @compiled
 def exp(v: Array) -> Array:
-    """Return the quaternion of a rotation vector (3,), rad."""
+    """Return the quaternion of a rotation vector (3,), rad.
+
+    >>> km.geometry.rotations.exp(np.array([0.0, 0.0, np.pi])).round(3)
+    array([0., 0., 1., 0.])
+    """
     a = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     s = math.sin(0.5 * a) / a if a > 1e-12 else 0.5
     return np.array([s * v[0], s * v[1], s * v[2], math.cos(0.5 * a)])
@@ -98,7 +131,11 @@ def exp(v: Array) -> Array:
 
 @compiled
 def log(q: Array) -> Array:
-    """Return the rotation vector (3,) of a unit quaternion, of length at most pi."""
+    """Return the rotation vector (3,) of a unit quaternion, of length at most pi.
+
+    >>> km.geometry.rotations.log(np.array([0.0, 0.0, 1.0, 0.0])).round(3)
+    array([0.   , 0.   , 3.142])
+    """
     s = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
     sign = -1.0 if q[3] < 0 else 1.0
     k = sign * (2.0 * math.atan2(s, abs(q[3])) / s if s > 1e-12 else 2.0)
@@ -125,6 +162,11 @@ def left_jacobian(v: Array) -> Array:
     """Return V(v) (3, 3) of SO(3): Exp(v + d) = Exp(V d) Exp(v) to first order, and (Exp(v) - I) p = V(v) (v x p).
 
     The right Jacobian is that of -v.
+
+    >>> km.geometry.rotations.left_jacobian(np.array([0.0, 0.0, 0.2])).round(3)
+    array([[ 0.993, -0.1  ,  0.   ],
+           [ 0.1  ,  0.993,  0.   ],
+           [ 0.   ,  0.   ,  1.   ]])
     """
     a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if a2 < 1e-2:
@@ -139,7 +181,13 @@ def left_jacobian(v: Array) -> Array:
 
 @compiled
 def left_jacobian_inverse(v: Array) -> Array:
-    """Return V(v)^-1 (3, 3): Log(Exp(d) Exp(v)) = v + V^-1 d to first order; regular for |v| below 2 pi."""
+    """Return V(v)^-1 (3, 3): Log(Exp(d) Exp(v)) = v + V^-1 d to first order; regular for |v| below 2 pi.
+
+    >>> km.geometry.rotations.left_jacobian_inverse(np.array([0.0, 0.0, 0.2])).round(3)
+    array([[ 0.997,  0.1  ,  0.   ],
+           [-0.1  ,  0.997,  0.   ],
+           [ 0.   ,  0.   ,  1.   ]])
+    """
     a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if a2 < 1e-2:
         q = 1 / 12 + a2 * (1 / 720 + a2 * (1 / 30240 + a2 / 1209600))
@@ -151,7 +199,11 @@ def left_jacobian_inverse(v: Array) -> Array:
 
 @compiled
 def left_jacobian_rate(v: Array, a: Array) -> Array:
-    """Return d (V(v) a) / d v (3, 3)."""
+    """Return d (V(v) a) / d v (3, 3).
+
+    >>> km.geometry.rotations.left_jacobian_rate(np.array([0.0, 0.0, 0.2]), np.array([1.0, 0.0, 0.0])).shape
+    (3, 3)
+    """
     a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if a2 < 1e-2:
         p = 1 / 2 - a2 * (1 / 24 - a2 * (1 / 720 - a2 / 40320))
@@ -171,7 +223,12 @@ def left_jacobian_rate(v: Array, a: Array) -> Array:
 
 @compiled
 def from_euler(e: Array) -> tuple[Array, Array]:
-    """Return the quaternion of (roll, pitch, yaw), rad, about x, then y, then z: Q = Qz Qy Qx; and Q_e (3, 3)."""
+    """Return the quaternion of (roll, pitch, yaw), rad, about x, then y, then z: Q = Qz Qy Qx; and Q_e (3, 3).
+
+    >>> q, Q_e = km.geometry.rotations.from_euler(np.array([0.0, 0.0, np.pi / 2]))
+    >>> q.round(3)
+    array([0.   , 0.   , 0.707, 0.707])
+    """
     cr, cp, cy = math.cos(0.5 * e[0]), math.cos(0.5 * e[1]), math.cos(0.5 * e[2])
     sr, sp, sy = math.sin(0.5 * e[0]), math.sin(0.5 * e[1]), math.sin(0.5 * e[2])
     q = np.array(
@@ -192,6 +249,10 @@ def to_euler(q: Array) -> tuple[Array, Array]:
 
     Through the half sum and half difference of roll and yaw, so that the rotation is kept to the last digit near
     pitch = +-pi/2 too.  There only one of the two is defined: roll is 0, and E_q grows without bound.
+
+    >>> e, E_q = km.geometry.rotations.to_euler(np.array([0.0, 0.0, 0.6, 0.8]))
+    >>> e.round(3)
+    array([0.   , 0.   , 1.287])
     """
     x, y, z, w = q[0], q[1], q[2], q[3]
     above, below = math.hypot(x - z, w + y), math.hypot(x + z, w - y)  # sqrt(1 +- sin pitch)

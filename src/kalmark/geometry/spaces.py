@@ -192,7 +192,13 @@ NO_TURN = np.zeros(0)
 
 @dataclass(frozen=True)
 class Space:
-    """A product of atoms; `names` label its error coordinates."""
+    """A product of atoms; `names` label its error coordinates.
+
+    >>> km.geometry.SE2.size, km.geometry.SE2.dof
+    (3, 3)
+    >>> km.geometry.SE2.plus(np.array([0.0, 0.0, 3.0]), np.array([1.0, 0.0, 0.5])).round(3)
+    array([ 1.   ,  0.   , -2.783])
+    """
 
     name: str
     kinds: tuple[int, ...]
@@ -292,5 +298,9 @@ def mount_space(pose: int, parameters: int = 0) -> Space:
 
 @lru_cache
 def Rn(n: int) -> Space:
-    """Return the space of n plain numbers that no rotation of the world changes."""
+    """Return the space of n plain numbers that no rotation of the world changes.
+
+    >>> km.geometry.Rn(4).dof
+    4
+    """
     return Space(f"R{n}", (SCALAR,) * n)

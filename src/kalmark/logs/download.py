@@ -93,7 +93,12 @@ OWN_COPIES = (
 
 @cache
 def list_data() -> tuple[Dataset, ...]:
-    """Return the datasets that `fetch` downloads."""
+    """Return the datasets that `fetch` downloads.
+
+    >>> from kalmark.logs import list_data
+    >>> [one.name for one in list_data()][:3]
+    ['lost_in_the_woods', 'mrclam/MRCLAM_Dataset6', 'mrclam/MRCLAM_Dataset8']
+    """
     text = resources.files("kalmark.logs").joinpath("datasets.json").read_text(encoding="utf-8")
     return tuple(
         Dataset(**{**entry, "files": tuple(DataFile(**file) for file in entry["files"])}) for entry in json.loads(text)

@@ -29,7 +29,12 @@ FORMATS: dict[str, Format] = {entry.name: entry for entry in (NATIVE, TUM, KITTI
 
 
 def known_formats() -> dict[str, Format]:
-    """Return all formats of logs, in the order in which they are tried: general ones last."""
+    """Return all formats of logs, in the order in which they are tried: general ones last.
+
+    >>> from kalmark.logs import known_formats
+    >>> "native" in known_formats()
+    True
+    """
     known = FORMATS | _of_plugins()[0]
     return dict(sorted(known.items(), key=lambda item: item[1].general))
 
@@ -71,6 +76,12 @@ def open_log(
     With `progress` tables that take longer than two seconds show a bar on standard error.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
     Raises LogError, with ``file:line:`` for a bad row.
+
+    >>> from kalmark.logs import write_native
+    >>> from kalmark.simulate import load_world, simulate
+    >>> folder = write_native(simulate(load_world("cloister", ["steps=50"])), "my_log")
+    >>> km.open_log("my_log", to_s=2.0)
+    <Log 'my_log' of 'robot': 42 events in 2.0 s, with truth>
     """
     entry, found = recognise(find_data(path), format)
     entry.refuse_options(options)

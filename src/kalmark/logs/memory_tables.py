@@ -36,6 +36,10 @@ def log_from(
     A table is a frame of pandas or polars, a table of pyarrow, or a mapping of columns to arrays, lists, or to one text
     or number for all rows.  None and NaN are empty cells.  `describes` has the content of a `rig.yaml`.  The other
     arguments are those of `open_log`.  Raises LogError, with table and row (from 1) for a bad one.
+
+    >>> controls = {"t_s": [0.0, 0.1], "robot": ["rover"] * 2, "v_mps": [0.5, 0.5], "w_radps": [0.0, 0.1]}
+    >>> km.log_from(controls=controls)
+    <Log 'log' of 'rover': 2 events in 0.1 s>
     """
     given = dict(zip(FILES, (controls, scans, fixes, truth, landmarks, gps, measurements), strict=False))
     there = {file: sheet(file.removesuffix(CSV), table) for file, table in given.items() if table is not None}

@@ -34,6 +34,11 @@ def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path
 
     Files without a row are not written.  Raises LogError if the log has something that the files cannot hold (an
     unnamed column, two scans of one sensor at one time, an id that would be read as another).
+
+    >>> from kalmark.logs import write_native
+    >>> controls = {"t_s": [0.0, 0.1], "robot": ["rover"] * 2, "v_mps": [0.5, 0.5], "w_radps": [0.0, 0.1]}
+    >>> write_native(km.log_from(controls=controls), "my_log").name
+    'my_log'
     """
     folder = Path(folder)
     own = [*FILES, RIG, *(str(Path(name).with_suffix(PARQUET)) for name in FILES)]

@@ -104,6 +104,10 @@ def pointwise(
     `inverse(y) -> v` lets it start landmarks.  `jacobian(v)` (m, d) and `inverse_jacobian(y)` (d, m) are numerical when
     not given.  `angular` marks the components that are angles.  With `noise_inside` the sensor is `measure(v, n)` and
     `noise` the covariance of n.
+
+    >>> squared = km.pointwise(lambda v: [v[0] ** 2 + v[1] ** 2], noise=[0.1])
+    >>> squared.expect(np.array([[3.0, 4.0]]))[0].round(3)
+    array([[25.]])
     """
     R = np.atleast_2d(np.asarray(noise, dtype=np.float64))
     if R.ndim != 2 or R.shape[0] != R.shape[1] or not np.isfinite(R).all():

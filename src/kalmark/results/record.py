@@ -77,6 +77,11 @@ def record(
     summary has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's
     models.  Without `pictures` what only these show is left out, which is faster: the map on the way, and what was in
     view.  Raises LogError if the log has other columns than the filter's motions and sensors, or two units of time.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle())
+    >>> drive = [km.Control(t_s=0.1 * k, robot="rover", u=(0.5, 0.02)) for k in range(4)]
+    >>> km.record(km.Slam(rover), drive, progress=False)
+    <Run '' of 'rover': 4 steps, 0 observations, 0 landmarks>
     """
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")

@@ -24,7 +24,17 @@ FILES = (
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Run(Recording):
-    """A recording with what is made of it: its figures, its pictures and its folder."""
+    """A recording with what is made of it: its figures, its pictures and its folder.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle())
+    >>> drive = [km.Control(t_s=0.1 * k, robot="rover", u=(0.5, 0.02)) for k in range(4)]
+    >>> run = km.record(km.Slam(rover), drive, progress=False)
+    >>> run.history.mean.shape
+    (4, 3)
+    >>> saved = run.save("out/drive")
+    >>> km.Run.load("out/drive")
+    <Run '' of 'rover': 4 steps, 0 observations, 0 landmarks>
+    """
 
     def evaluate(self, batch: bool = False) -> dict[str, Any]:
         """Return the figures of ``summary.json``; with `batch` also the comparison with the batch solution."""

@@ -185,7 +185,12 @@ class World(OfFile):
 
 
 def shipped_worlds() -> dict[str, Path]:
-    """Return the worlds that come with kalmark, by name."""
+    """Return the worlds that come with kalmark, by name.
+
+    >>> from kalmark.simulate import shipped_worlds
+    >>> list(shipped_worlds())[:3]
+    ['arva', 'camera', 'cloister']
+    """
     return shipped_configs("configs/worlds")
 
 
@@ -194,6 +199,10 @@ def load_world(path_or_name: str | Path, overrides: Sequence[str] = ()) -> World
 
     ``robots.each`` in an override stands for every robot of the world.
     Raises ConfigError: ``file:line:column: key.path: got value, expected what``.
+
+    >>> from kalmark.simulate import load_world
+    >>> load_world("cloister", ["steps=100"]).steps
+    100
     """
     path = resolve_name(path_or_name, shipped_worlds(), "world")
     tree = read_tree(path, overrides)

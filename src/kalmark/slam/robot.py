@@ -68,6 +68,9 @@ class Mount:
     by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
     called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas.  `robust`
     makes outliers count less, "huber" or "student" (docs/association.md; None: all count in full).
+
+    >>> km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1), at=(0.3, 0.0, 0.0)).at
+    array([0.3, 0. , 0. ])
     """
 
     sensor: Sensor
@@ -140,6 +143,9 @@ class Robot:
     the action on controls that stop: "widen" the covariance by what the robot may have moved meanwhile, at most by
     these speeds (None: by the largest so far), "refuse" to go on, or "ignore" it.  Controls up to `rests_until_ns` do
     not move it: those at rest, from which its start was found.
+
+    >>> km.Robot("rover", km.motion.Unicycle(sigma_v_mps=0.1), start=(1.0, 2.0, 0.0)).name
+    'rover'
     """
 
     name: str

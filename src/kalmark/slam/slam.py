@@ -79,6 +79,15 @@ class Slam(Estimate):
     `upkeep` decides when an observation without an id becomes a landmark (docs/association.md).  Events must come in
     the order of their times, none more than `longest_pause_s` after the one before it: its stamp is wrong.  After 10
     such events in a row, none of them that far after the one before it, it was a pause.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover)
+    >>> moved = slam.process(km.Control(t_s=0.0, robot="rover", u=(0.5, 0.02)))
+    >>> report = slam.process(km.Scan(t_s=0.1, robot="rover", sensor="lidar", y=[[4.2, 0.3]], ids=[7]))
+    >>> slam.mean("rover").round(3), slam.mean(7).round(2)
+    (array([0.05 , 0.   , 0.002]), array([4.06, 1.25]))
+    >>> slam.covariance("rover", 7).shape
+    (5, 5)
     """
 
     def __init__(
