@@ -72,7 +72,7 @@ def run(name: str, seed: int) -> dict[str, float]:
     options = [*SEQUENCES[name], f"robots.each.sensors.camera.detector.seed={seed}", *([LINES] if lines else [])]
     config, log = open_run("visual", None, options)
     slam = build_slam(config, log)
-    eye = slam.state.front_ends[log.robots[0], "camera"]
+    eye = slam.state.sources[log.robots[0], "camera"]
     assert isinstance(eye, FrontEnd)
     way, took, matched, wanted, lines_matched = [], [], 0, 0, 0
     parts = [list(eye.times.values())]  # so far, s

@@ -32,7 +32,7 @@ def errors(name: str, seed: int) -> dict[Id, dict[int, tuple[Array, float]]]:
     log = simulate(world, seed=seed)
     slam = build_slam(world.config(), log)
     (robot,) = log.robots
-    front_end, sensor = slam.state.front_ends[robot, "camera"], slam.state.channels[robot, "camera"].sensor
+    front_end, sensor = slam.state.sources[robot, "camera"], slam.state.channels[robot, "camera"].sensor
     assert isinstance(front_end, FrontEnd)
     places: dict[Id, Array] = {}
     found: dict[Id, dict[int, tuple[Array, float]]] = {}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import kalmark as km
 
 OWN = '''
 from pathlib import Path
@@ -53,6 +56,7 @@ last-stop = trams:last_stop
 [kalmark.names]
 Tram = trams:Tram
 """
+AGAIN = "; expected it installed: pip install --force-reinstall --no-deps kalmark"
 OUTSIDE = ("kalmark.bags", "kalmark.datasets", "kalmark.diagnosis", "kalmark.vision")
 WITHOUT = f"""
 import sys
@@ -60,7 +64,7 @@ import sys
 class NotThere:
     def find_spec(self, name, path=None, target=None):
         if name in {OUTSIDE}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}")
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
 sys.meta_path.insert(0, NotThere())
 """
@@ -160,14 +164,25 @@ for call in (
     except (km.KalmarkError, AttributeError) as error:
         print(error)
 main(["convert", "log", "log.mcap"])
-main(["tune", "camera.yaml"])
+print([main([verb, "x", "--option", "1"]) for verb in ("bag", "diagnose", "tune")])
 """
     done = python(WITHOUT + code, tmp_path)
-    mrclam, unknown, detector, name = done.stdout.splitlines()
+    mrclam, unknown, detector, name, statuses = done.stdout.splitlines()
+    assert statuses == "[2, 2, 2]"
     assert mrclam.startswith("log format is 'mrclam': 'mrclam' of kalmark.datasets.mrclam:MRCLAM cannot be loaded: ")
-    assert unknown.endswith("'bag' of kalmark.bags.importer:BAG cannot be loaded: No module named 'kalmark.bags'")
+    assert f"'bag' of kalmark.bags.importer:BAG cannot be loaded: No module named 'kalmark.bags'{AGAIN}" in unknown
     assert "robots.r.sensors.eye.detector: got {'type': 'active_search'}, expected" in detector
     assert "'vision' of kalmark.vision cannot be loaded" in detector
     assert name.startswith("'diagnose' of kalmark.diagnosis.verdict:diagnose cannot be loaded")
     assert "kalmark: 'mcap' of kalmark.bags.run_messages:export cannot be loaded" in done.stderr
-    assert "kalmark: the verb 'tune' of kalmark.diagnosis.tune_verb:tune cannot be loaded" in done.stderr
+    tune = "kalmark: 'tune' of kalmark.diagnosis.tune_verb:tune cannot be loaded: No module named 'kalmark.diagnosis'"
+    assert done.stderr.splitlines()[-1] == tune + AGAIN
+
+
+def test_the_filter_imports_no_kind_of_raw_data() -> None:
+    """It takes `Raw`: images are of the detectors and sources that search them."""
+    root = Path(km.__file__).parent
+    for package in ("association", "filter", "management", "slam", "tracks"):
+        for file in (root / package).rglob("*.py"):
+            nodes = [node for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.ImportFrom)]
+            assert "Frame" not in {alias.name for node in nodes for alias in node.names}, file

@@ -15,6 +15,7 @@ MODULES = (
     "association", "detect", "estimators", "geometry", "initialization", "landmarks", "motion", "presets", "sensors",
     "vision",
 )  # fmt: skip
+OF_PLUGINS = ("Verdict", "diagnose", "vision")
 PACKAGES = (
     "kalmark.campaign", "kalmark.config", "kalmark.declare", "kalmark.errors", "kalmark.events", "kalmark.logs",
     "kalmark.models.protocols", "kalmark.report", "kalmark.results.history", "kalmark.simulate",
@@ -23,7 +24,7 @@ PACKAGES = (
 
 
 def test_a_console_offers_the_names_of_kalmark_and_no_others() -> None:
-    assert dir(km) == sorted([*km.__all__, "__version__"])
+    assert dir(km) == sorted([*km.__all__, *OF_PLUGINS, "__version__"])
     assert all(hasattr(km, name) for name in dir(km))
     assert {name for name in dir(km) if isinstance(getattr(km, name), ModuleType)} == {*MODULES}
 

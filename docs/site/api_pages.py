@@ -79,7 +79,7 @@ def public_names(module: str) -> dict[str, Any]:
 
 def _page(shown: str, name: str, thing: Any) -> str:
     """Return the page of a name: that of `km` itself where it is one of those."""
-    return f"kalmark.{name}" if name in km.__all__ and getattr(km, name) is thing else f"{shown}.{name}"
+    return f"kalmark.{name}" if name in dir(km) and getattr(km, name) is thing else f"{shown}.{name}"
 
 
 def _head(title: str) -> str:

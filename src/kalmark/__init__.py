@@ -17,9 +17,8 @@ from kalmark.errors import KalmarkError, PluginError
 from kalmark.plugins import entry_points_of, load
 
 if TYPE_CHECKING:
-    from kalmark import association, detect, geometry, vision
+    from kalmark import association, detect, geometry
     from kalmark.declare import register
-    from kalmark.diagnosis.verdict import Verdict, diagnose
     from kalmark.events import Control, Fix, Frame, Scan
     from kalmark.filter import estimators
     from kalmark.logs import Log, log_from, open_log, stream_log
@@ -39,9 +38,9 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Attention", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount", "Observation",
-    "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "Verdict", "association", "detect", "diagnose", "estimators",
-    "geometry", "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record",
-    "register", "sensors", "stream_log", "vision",
+    "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry",
+    "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record", "register",
+    "sensors", "stream_log",
 ]  # fmt: skip
 
 _MODULES = {
@@ -93,4 +92,4 @@ def _of_plugin(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, "__version__"])
+    return sorted({*__all__, *entry_points_of("names"), "__version__"})

@@ -20,7 +20,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import EventError, ImageError, KalmarkError
 
-__all__ = ["Control", "Event", "Fix", "Frame", "Scan", "sort_events", "sort_key"]
+__all__ = ["Control", "Event", "Fix", "Frame", "Raw", "Scan", "sort_events", "sort_key"]
 
 Id = int | str
 
@@ -357,10 +357,22 @@ class Fix(_Timed):
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
-class Frame(_Timed):
+class Raw(_Timed):
+    """Raw data of one sensor of one robot at one instant, of which the detector of that sensor makes a scan.
+
+    A frozen dataclass of its own for each kind of data: `Frame`, or one of a plug-in's.
+    """
+
+    t_ns: int
+    robot: str
+    sensor: str
+
+
+@dataclass(frozen=True, slots=True, init=False, eq=False)
+class Frame(Raw):
     """A frame of one camera of one robot at one instant: an image, and the depth of its pixels where that is measured.
 
-    The detector of its sensor makes a scan of it.  `image` (H, W) or (H, W, 3) of bytes, blue, green and red, `right`,
+    `image` (H, W) or (H, W, 3) of bytes, blue, green and red, `right`,
     that of the right camera of a rectified pair, of which `image` is the left one, and `depth` (H, W) in m, 0 where
     there is none, are arrays, or functions that read them each time they are needed: a log of many frames holds no
     pixel.
@@ -369,9 +381,6 @@ class Frame(_Timed):
     (480, 640)
     """
 
-    t_ns: int
-    robot: str
-    sensor: str
     image: Array | Callable[[], Array]
     depth: Array | Callable[[], Array] | None
     right: Array | Callable[[], Array] | None
@@ -447,9 +456,9 @@ def _depths(depth: Any) -> Array:
     return metres.astype(np.float64)
 
 
-Event = Control | Scan | Frame | Fix
+Event = Control | Scan | Raw | Fix
 
-_RANK: dict[type, int] = {Control: 0, Scan: 1, Frame: 1, Fix: 2}
+_RANK: dict[type, int] = {Control: 0, Fix: 2}  # 1: of a scan, or of raw data
 
 
 def label_of_event(event: Event) -> str:
@@ -459,15 +468,20 @@ def label_of_event(event: Event) -> str:
 
 def kind_of(event: Event) -> tuple[str, str, str]:
     """Return the kind of an event, its robot and its sensor ("" of what has none)."""
-    return type(event).__name__, event.robot, event.sensor if isinstance(event, Scan | Frame) else ""
+    return type(event).__name__, event.robot, event.sensor if isinstance(event, Scan | Raw) else ""
 
 
 def sort_key(event: Event) -> tuple[int, int, str, str]:
-    """Sort key of events: time, then Control, Scan or Frame, Fix, then robot, then sensor.
+    """Sort key of events: time, then Control, Scan or raw data, Fix, then robot, then sensor.
 
     A stable sort keeps arrival.
     """
-    return event.t_ns, _RANK[type(event)], event.robot, event.sensor if isinstance(event, Scan | Frame) else ""
+    return (
+        event.t_ns,
+        _RANK.get(type(event), 1),
+        event.robot,
+        event.sensor if isinstance(event, Scan | Raw) else "",
+    )
 
 
 def sort_events(events: list[Event]) -> list[Event]:

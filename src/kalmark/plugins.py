@@ -4,6 +4,8 @@
 |---|---|
 | `kalmark.formats` | a `kalmark.logs.source.Format` of logs, under its name |
 | `kalmark.models` | a module that registers models (`kalmark.register`) |
+| `kalmark.layouts` | a layout of simulated worlds, under its `type` |
+| `kalmark.keys` | what a key of a sensor does: a module with `complete(tree)` and `with_events(config, log)` |
 | `kalmark.verbs` | a function of the command line |
 | `kalmark.writers` | what `kalmark convert` writes, under the ending of its file: `(path, log, run) -> {part: count}` |
 | `kalmark.names` | a name of the package `kalmark` |
@@ -39,7 +41,15 @@ def load(group: str, name: str) -> Any:
     try:
         return entry.load()
     except Exception as error:
-        raise PluginError(f"{name!r} of {entry.value} cannot be loaded: {error}") from None
+        raise PluginError(f"{name!r} of {entry.value} cannot be loaded: {error}{_cure(entry, error)}") from None
+
+
+def _cure(entry: EntryPoint, error: Exception) -> str:
+    """Return how to install a plug-in of which a module is missing."""
+    package, missing = entry.module.partition(".")[0], getattr(error, "name", None) or ""
+    if not isinstance(error, ImportError) or missing.partition(".")[0] != package or entry.dist is None:
+        return ""
+    return f"; expected it installed: pip install --force-reinstall --no-deps {entry.dist.name}"
 
 
 def load_all(group: str) -> tuple[dict[str, Any], dict[str, PluginError]]:

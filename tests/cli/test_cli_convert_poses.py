@@ -70,7 +70,7 @@ def test_a_run_comes_back_from_its_graph_with_the_same_map(space: bool, kalmark:
         np.testing.assert_allclose(mean, true, atol=0.5 * sigma + 1e-3)
         np.testing.assert_allclose(np.linalg.eigvalsh(P)[-1], sigma**2, rtol=0.3)
     refused = kalmark("convert", "log", "log.g2o")
-    assert refused.status == 2 and "not the folder of a run" in refused.err
+    assert refused.status == 2 and "no run to write, expected the folder of one" in refused.err
 
 
 def test_a_run_without_scans_has_no_graph(kalmark: Kalmark, tmp_path: Path) -> None:

@@ -175,7 +175,7 @@ def test_a_frame_is_what_its_image_as_a_scan_is_and_is_read_when_it_is_needed() 
     assert np.array_equal(one.mean(7), other.mean(7))
     assert run.history.stepped == "scan"
     assert run.history.landmark.tolist() == ["7"]
-    with pytest.raises(km.errors.EventError, match="frame at t=2 s: 'blind' has no detector for images"):
+    with pytest.raises(km.errors.EventError, match="frame at t=2 s: 'blind' has no detector for a frame"):
         other.process(km.Frame(2.0, "r", "blind", image))
     with pytest.raises(km.errors.EventError, match=r"t=2 s: the image is float64 \(480, 640\), expected bytes"):
         other.process(km.Frame(2.0, "r", "camera", lambda: image * 1.0))

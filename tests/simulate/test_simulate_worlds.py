@@ -18,19 +18,17 @@ from kalmark.simulate.layouts import (
     Cloister,
     House,
     Listed,
-    ListedPlane,
     ListedTag,
     Loop,
     RandomBox,
     RandomField,
     TagRoom,
-    TexturedPlanes,
-    TexturedRoom,
     ThickCloister,
 )
 from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control_of_velocity
 from kalmark.simulate.sights import SimulatedSensing
 from kalmark.simulate.worlds import SimulatedRobot
+from kalmark.vision.textured_layouts import ListedPlane, TexturedPlanes, TexturedRoom
 
 SMALL = ["steps=20"]
 PAGE = Path(__file__).parents[2] / "docs" / "worlds.md"

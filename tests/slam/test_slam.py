@@ -64,7 +64,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "time running backwards": (lambda: km.Control(0.5, "rover", (1, 0)), "comes after one at t=1 s"),
     "fix without covariance": (lambda: km.Fix(2, "rover", (1, 0)), "cov is missing"),
     "fix noise not definite": (lambda: km.Fix(2, "rover", (1, 0), np.zeros((2, 2))), "positive definite"),
-    "no event at all": (lambda: "a control", "got str, expected a Control, a Scan, a Frame or a Fix"),
+    "no event at all": (lambda: "a control", "got str, expected a Control, a Scan, a Fix or raw data of a sensor"),
     "fix of wrong size": (lambda: km.Fix(2, "rover", (1, 0, 0), np.eye(3)), "expected (2,)"),
 }
 

@@ -15,7 +15,6 @@ from kalmark.filter.map import StochasticMap
 from kalmark.geometry import POINT2, SE2
 from kalmark.tracks.channel import Channel, default_landmark, huber_length, landmarks_in_frame
 from kalmark.tracks.clones import Clones
-from kalmark.tracks.joint_expectation import joint
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Track, Tracks
 
@@ -223,16 +222,3 @@ def test_a_start_is_added_with_the_jacobian_in_the_robot_and_the_noise_of_its_ro
         start._replace(Q=Q * np.nan),
     ):
         assert isinstance(broken, Start) and not broken.is_finite
-
-
-def test_a_joint_expectation_is_the_covariance_of_all_with_the_state() -> None:
-    """C = P H', S = H P H' with H of a head of two numbers and of one landmark of two each; only half of P is read."""
-    rng, order = np.random.default_rng(0), np.array([4, 0, 5, 2, 1, 3])
-    P, E_h, E_l = random_covariance(6, 1.0), rng.normal(size=(2, 3, 2)), rng.normal(size=(2, 3, 2))
-    H = np.zeros((6, 6))
-    for k, at in enumerate((2, 4)):
-        H[3 * k : 3 * k + 3, :2], H[3 * k : 3 * k + 3, at : at + 2] = E_h[k], E_l[k]
-    C, S = joint(np.tril(P), order, E_h, E_l, np.array([2, 4]), np.array([2, 2]))
-    right = P[np.ix_(order, order)]
-    np.testing.assert_allclose(C, right @ H.T, atol=1e-12)
-    np.testing.assert_allclose(S, H @ right @ H.T, atol=1e-12)

@@ -9,7 +9,8 @@ import kalmark as km
 from kalmark.codec import Reader, Writer, kind_of
 from kalmark.errors import KalmarkError
 from kalmark.geometry.frames3d import from_euler_pose, to_frame_many
-from kalmark.vision.beginning import LEAST_RHO, Beginning, Begun, residuals
+from kalmark.slam.sources import Replay
+from kalmark.vision.beginning import LEAST_RHO, Beginning, residuals
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
 
@@ -26,7 +27,7 @@ def sideways(frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndar
     return np.array([from_euler_pose(pose)[0] for pose in poses]), points
 
 
-def tried(poses: np.ndarray, points: np.ndarray, estimated: np.ndarray, rng: np.random.Generator) -> Begun | None:
+def tried(poses: np.ndarray, points: np.ndarray, estimated: np.ndarray, rng: np.random.Generator) -> Replay | None:
     """Return how a map begins whose filter has `estimated` (F, 7), of pixels with a noise of a fifth."""
     beginning = Beginning()
     for k, (T, wrong) in enumerate(zip(poses, estimated, strict=True)):
@@ -95,7 +96,7 @@ def test_anything_but_a_frame_ends_the_beginning() -> None:
     detector = km.vision.ActiveSearch(in_view=20)
     mount = km.Mount(CAMERA, at=(0, 0, 0, 0, 0, 0, 1), landmark=km.landmarks.Homogeneous(0.5, 0.5), detector=detector)
     slam = km.Slam(km.Robot("camera", km.motion.ConstantVelocity3D(), sensors={"eye": mount}))
-    front_end = slam.state.front_ends["camera", "eye"]
+    front_end = slam.state.sources["camera", "eye"]
     for refused in (
         lambda: slam.process(km.Control(t_s=0.0, robot="camera", u=np.zeros(5))),
         lambda: slam.add_landmark("a", (1.0, 2.0)),

@@ -7,11 +7,11 @@ import pytest
 
 import kalmark as km
 from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, to_frame_many
-from kalmark.simulate.rendering import Rectangle as Wall
-from kalmark.simulate.rendering import Renderer, texture
 from kalmark.vision.appearance import View, predict_templates, take_view
 from kalmark.vision.features import Cells
 from kalmark.vision.planes import Plane, plane_from_depths, plane_from_match
+from kalmark.vision.rendering import Rectangle as Wall
+from kalmark.vision.rendering import Renderer, texture
 from kalmark.vision.template_matching import Searcher
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")

@@ -13,9 +13,9 @@ import kalmark as km
 from kalmark.config import build_slam
 from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, minus
 from kalmark.simulate import load_world, simulate
-from kalmark.simulate.rendering import Rectangle, Renderer, texture
 from kalmark.vision.appearance import View, take_view
 from kalmark.vision.recognition import LEAST, REACH, describe_corners, describe_views, pairs, recognize_place
+from kalmark.vision.rendering import Rectangle, Renderer, texture
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
 
@@ -145,7 +145,7 @@ def test_a_camera_that_has_drifted_finds_the_landmarks_of_a_place_seen_again() -
     shift = np.array([0.15, 0.0, 0.05])
     for frame in frames:
         slam.process(frame)
-    front_end = slam.state.front_ends["robot", "camera"]
+    front_end = slam.state.sources["robot", "camera"]
     old = {name for name, look in front_end.looks.items() if look.fitted >= 10 and look.seen < 34}
     for name in old:
         slot = slam.state.tracks.slots[name]

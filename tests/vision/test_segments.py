@@ -13,8 +13,8 @@ import kalmark as km
 from kalmark.config import open_run
 from kalmark.errors import ConfigError
 from kalmark.geometry.frames3d import from_euler_pose
-from kalmark.simulate.rendering import Rectangle, Renderer
 from kalmark.vision.overlay import MATCH
+from kalmark.vision.rendering import Rectangle, Renderer
 from kalmark.vision.segments import REACH_PX, LineFrontEnd, assign_pairs, compatible_segments, profiles
 from kalmark.vision.straight import Straightened
 
@@ -78,7 +78,7 @@ def new_slam(landmark: Any) -> km.Slam:
 
 
 def looks(slam: km.Slam) -> LineFrontEnd:
-    front_end = slam.state.front_ends["hand", "eye"]
+    front_end = slam.state.sources["hand", "eye"]
     assert isinstance(front_end, LineFrontEnd)
     return front_end
 

@@ -11,12 +11,12 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, open_run
 from kalmark.geometry.frames3d import compose, from_euler_pose, from_frame_many, minus, to_frame_many
-from kalmark.simulate.rendering import Rectangle, Renderer, texture
-from kalmark.tracks.joint_expectation import Prospect
 from kalmark.vision.appearance import predict_templates, take_view
 from kalmark.vision.depth_images import inverse_depths, with_depths
+from kalmark.vision.joint_expectation import Prospect
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane as Surroundings
+from kalmark.vision.rendering import Rectangle, Renderer, texture
 from kalmark.vision.selection import Search
 from kalmark.vision.template_matching import Searcher, correlation
 
@@ -191,7 +191,7 @@ def test_a_camera_finds_its_way_in_a_rendered_room_twice_the_same_and_from_a_sav
         if k in SAVED:
             one.save(tmp_path / f"{k}.kmk")
     assert sum(o.outcome == "associated" for o in report.observations) > 15
-    picture = km.vision.overlay(one.state.front_ends["camera", "eye"], report, scale=2)
+    picture = km.vision.overlay(one.state.sources["camera", "eye"], report, scale=2)
     assert picture.shape == (480, 640, 3)
     assert (picture[:, :, 1] > picture[:, :, 0].astype(int) + 50).sum() > 15 * 12  # green dots, yellow ellipses
     p, q = np.array(way) - np.mean(way, axis=0), true[:, :3] - true[:, :3].mean(axis=0)
@@ -216,7 +216,7 @@ def test_patches_are_read_from_a_file_as_the_bytes_they_are(tmp_path: Path) -> N
     for frame in room(12)[0]:
         slam.process(frame)
     slam.save(tmp_path / "map.kmk")
-    looks, again = (each.state.front_ends["camera", "eye"].looks for each in (slam, km.Slam.load(tmp_path / "map.kmk")))
+    looks, again = (each.state.sources["camera", "eye"].looks for each in (slam, km.Slam.load(tmp_path / "map.kmk")))
     assert again.keys() == looks.keys()
     for one, same in zip(looks.values(), again.values(), strict=True):
         assert (one.fitted, one.misfit) == (same.fitted, same.misfit)
@@ -230,7 +230,7 @@ def test_a_landmark_whose_matches_slide_over_the_image_is_given_up_and_one_known
         frames, _ = room(40)
         for frame in frames[:-1]:
             slam.process(frame)
-        looks = slam.state.front_ends["camera", "eye"].looks
+        looks = slam.state.sources["camera", "eye"].looks
         fits = [name for name, look in looks.items() if look.fitted >= 20 and not look.missed]
         assert max(looks[name].misfit for name in fits) < 2  # d2 a number measured
         looks[fits[0]].surveyed = known
@@ -278,7 +278,7 @@ def test_landmarks_known_beforehand_are_found_in_the_first_image_and_set_place_a
         nees.append(error @ np.linalg.solve(slam.covariance("camera")[:6, :6], error))
     assert np.sqrt(np.mean(np.sum(np.square(off[10:]), axis=1))) < 0.01  # m; nothing aligned
     assert np.mean(nees) < 12  # 6 degrees of freedom
-    assert set(known) <= set(slam.state.front_ends["camera", "eye"].looks)
+    assert set(known) <= set(slam.state.sources["camera", "eye"].looks)
     assert np.array_equal(slam.mean("camera"), again.mean("camera"))
 
 
@@ -290,7 +290,7 @@ def test_landmarks_known_beforehand_of_which_an_image_shows_nothing_are_not_gues
     report = slam.process(km.Frame(0.0, "camera", "eye", flat))
     assert not report.observations
     assert np.array_equal(slam.mean("camera")[:7], before)
-    assert known.keys() <= slam.state.front_ends["camera", "eye"].looks.keys()
+    assert known.keys() <= slam.state.sources["camera", "eye"].looks.keys()
 
 
 def test_a_frame_whose_image_cannot_be_read_changes_nothing() -> None:
@@ -320,7 +320,7 @@ def test_two_cameras_share_a_map_whose_landmarks_each_finds_by_its_own_patches_a
     assert sum(o.outcome == "associated" for o in report.observations) > 15
     names = {str(name).rsplit(" ", 1)[0] for name in one.landmarks().ids}
     assert names == {"camera.eye", "camera.side"}
-    looks = {key: front_end.looks for key, front_end in one.state.front_ends.items()}
+    looks = {key: front_end.looks for key, front_end in one.state.sources.items()}
     assert set(looks["camera", "eye"]) | set(looks["camera", "side"]) == set(one.landmarks().ids)
     again = km.Slam.load(tmp_path / "map.kmk")
     for event in events[23:]:
@@ -382,7 +382,7 @@ def test_a_camera_with_depths_knows_the_scale_also_where_half_of_the_image_has_n
     length = np.linalg.norm(np.diff(true[:, :3], axis=0), axis=1).sum()
     assert np.sqrt(np.mean(np.sum(np.square(off), axis=1))) < 0.01 * length  # in metres, nothing aligned
     assert np.mean(nees) < 12  # 6 degrees of freedom
-    depths = slam.state.front_ends["camera", "eye"].prospect
+    depths = slam.state.sources["camera", "eye"].prospect
     assert depths.belief.e.shape[1] == 3
 
 

@@ -27,7 +27,7 @@ from kalmark.arrays import Array
 from kalmark.bags.mcap_writer import RECORD, Outgoing, header_fields
 from kalmark.bags.opening import Bag, Received
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, label_of_event, sort_key
+from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event, sort_key
 from kalmark.logs.log import Log, PositionTrack, Trajectory
 from kalmark.logs.native_writer import id_text
 from kalmark.logs.source import Request, landmark_id
@@ -99,8 +99,8 @@ def message_function(log: Log) -> Any:
             return record_message(
                 FIXES, event.t_ns, event.robot, event.y, columns=POSITION[: len(event.y)], cov=event.cov
             )
-        if isinstance(event, Frame):
-            raise LogError(f"{label_of_event(event)}: an image, expected controls, scans and fixes")
+        if isinstance(event, Raw):
+            raise LogError(f"{label_of_event(event)}: raw data, expected controls, scans and fixes")
         columns = log.sensor_columns.get((event.robot, event.sensor), ())
         ids = ["" if id_ is None else id_text(id_) for id_ in event.ids or ()]
         return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov)

@@ -21,7 +21,7 @@ from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES
 from kalmark.batch.motion_chain import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
 from kalmark.batch.wall_anchors import anchors
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, label_of_event
+from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import mount_space
 from kalmark.models.landmarks import Point2D, Wall2D
@@ -29,8 +29,8 @@ from kalmark.models.observe import inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor, sees_kinds
 from kalmark.models.walls import axes
 from kalmark.slam.checks import measurements
+from kalmark.slam.sources import RawDetector
 from kalmark.tracks.channel import huber_length
-from kalmark.tracks.front_ends import FrameDetector
 
 if TYPE_CHECKING:
     from kalmark.slam.robot import Robot
@@ -191,15 +191,15 @@ class BatchReplay:
             return self.chain.node_at(robot, t_ns)
         return self.apart.setdefault((robot, t_ns), len(self.apart))
 
-    def _found(self, event: Scan | Frame) -> Scan:
+    def _found(self, event: Scan | Raw) -> Scan:
         """Return the scan of what the detector of a sensor, if it has one, found."""
         detector = self.given.robots[event.robot].sensors[event.sensor].detector
         if isinstance(event, Scan):
             return event if detector is None else detector(event)
-        if not isinstance(detector, FrameDetector):
-            why = f"{event.sensor!r} searched its images where the filter expected landmarks"
+        if not isinstance(detector, RawDetector):
+            why = f"{event.sensor!r} searched its data where the filter expected landmarks"
             raise unsolvable_problem(
-                f"{label_of_event(event)}: {why}, expected scans, or a detector that searches each image by itself"
+                f"{label_of_event(event)}: {why}, expected scans, or a detector that searches each by itself"
             )
         return detector.scan_of(event)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import gc
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from typing import Annotated
 
@@ -19,13 +19,23 @@ from kalmark.cli.live import live
 from kalmark.cli.logs import config, data, simulate, worlds
 from kalmark.cli.run import demo, run, warm_up
 from kalmark.cli.shared import say
-from kalmark.errors import KalmarkError
+from kalmark.errors import KalmarkError, PluginError
 from kalmark.plugins import load_all
 
 USAGE: type[Exception] = typer.BadParameter.__mro__[2]  # typer's base of all mistakes on the command line
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # no place for a file
 INTERRUPTED = 130
+ANY_ARGUMENTS = {"ignore_unknown_options": True, "allow_extra_args": True}
 GARBAGE = 10_000  # objects between two collections of garbage: at Python's 700 they take an eighth of a short run
+
+
+def _refused(failure: PluginError) -> Callable[[], None]:
+    """Return the verb of a plug-in that cannot be loaded."""
+
+    def verb() -> None:
+        raise failure
+
+    return verb
 
 
 app = typer.Typer(
@@ -58,8 +68,8 @@ app.add_typer(data, name="data")
 verbs, missing = load_all("verbs")
 for name, function in verbs.items():
     app.command(name)(function)
-for failure in missing.values():
-    say(f"kalmark: the verb {failure}", err=True)
+for name, failure in missing.items():
+    app.command(name, help=f"Missing: {failure}.", context_settings=ANY_ARGUMENTS)(_refused(failure))
 
 
 def _show_version(wanted: bool) -> None:

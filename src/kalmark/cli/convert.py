@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.results.run import Run
 
-G2O, POSES = ".g2o", (".tum", ".kitti")
+POSES = (".tum", ".kitti")
 
 
 def convert(
@@ -38,21 +38,19 @@ def convert(
     from kalmark.logs import write_native
 
     writes = out.suffix[1:] in entry_points_of("writers")
-    if writes or out.suffix in (G2O, *POSES):
+    if writes or out.suffix in POSES:
         if out.exists():
             raise KalmarkError(f"{out}: this file exists already, expected a new one")
         writable(out.parent)
     else:
         writable(out)
-    log, run = _read(source, log_format, trust, whole=out.suffix != G2O)
+    log, run = _read(source, log_format, trust)
     if out.suffix in POSES:
         _write_path(out, log, run, robot)
         return
-    if out.suffix == G2O:
-        _write_graph(out, source, log, run)
-    elif writes:
+    if writes:
         counts = load("writers", out.suffix[1:])(out, log, run)
-        say(f"{out}: {sum(counts.values())} messages on {', '.join(sorted(counts))}")
+        say(f"{out}: {sum(counts.values())} records of {', '.join(sorted(counts))}")
     elif log is not None:
         write_native(log, out, parquet=parquet)
     if log is not None:
@@ -81,23 +79,11 @@ def _write_path(out: Path, log: Log | None, run: Run | None, robot: str | None) 
     say(f"{', '.join(map(str, files))}: {len(paths[names[0]])} poses of {names[0]}")
 
 
-def _write_graph(out: Path, source: Path, log: Log | None, run: Run | None) -> None:
-    """Write a run as a graph.  Raises KalmarkError."""
-    from kalmark.config import build_slam, open_run
-    from kalmark.files import write
-    from kalmark.results.pose_graph import g2o_text
-
-    if log is None or run is None:
-        raise KalmarkError(f"{source}: not the folder of a run, expected one: a graph needs estimates and noise")
-    slam = build_slam(open_run(source / "config.yaml")[0], log)
-    write(out, g2o_text(run, log, slam.robots))
-
-
-def _read(source: Path, log_format: str | None, trust: bool, whole: bool) -> tuple[Log | None, Run | None]:
-    """Return the log, with `whole` increments as it has them, and the run if `source` is the folder of one."""
+def _read(source: Path, log_format: str | None, trust: bool) -> tuple[Log | None, Run | None]:
+    """Return the log with its increments as recorded, and the run if `source` is the folder of one."""
     from kalmark.logs import open_log
 
-    overrides = ("log.increments=recorded",) if whole else ()
+    overrides = ("log.increments=recorded",)
     if (source / "summary.json").is_file() and (source / "config.yaml").is_file():
         from kalmark.config import open_run
         from kalmark.results.run import Run

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
-from kalmark.events import Control, Frame, Scan
+from kalmark.events import Control, Frame, Raw, Scan
 from kalmark.geometry.named_poses import pose_of, world_of
 from kalmark.logs.formats import known_formats
 from kalmark.logs.image_files import image_size
@@ -103,16 +102,15 @@ def slam_described(said: dict[str, Any], **given: Any) -> Slam:
 
 
 def config_dict(config: Config) -> dict[str, Any]:
-    """Return everything in force as plain values, to be saved as ``config.yaml`` and loaded again.
+    """Return what is in force as plain values, to be saved as ``config.yaml`` and loaded again.
+
+    It has what was asked for: presets, files, `each`.  `kalmark.slam.description.describe` has the filter made of it.
 
     >>> from kalmark.config import config_dict, load_config
     >>> config_dict(load_config("native"))["estimator"]["type"]
     'invariant'
     """
-    content = _plain(config)
-    return {"version": version("kalmark"), "seed": config.seed} | {
-        key: value for key, value in content.items() if key not in ("version", "seed")
-    }
+    return dict(_plain(config))
 
 
 def _plain(value: Any) -> Any:
@@ -252,7 +250,7 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
             kind = "its beams" if raw else f"its type {config.robots[key].sensors[sensor].type}"
             fitting, wanted = [] if raw else _fitting("sensor", given), f"{', '.join(columns)} of {kind}"
             raise _other_columns(log, name, sensor, given, wanted, fitting, f"{key}.sensors.{sensor}", columns)
-    used = {event.sensor: None for event in log.events if isinstance(event, Scan | Frame) and event.robot == name}
+    used = {event.sensor: None for event in log.events if isinstance(event, Scan | Raw) and event.robot == name}
     other = next((sensor for sensor in used if sensor not in mounts), None)
     if other is None or config.log.on_error == "skip":
         return

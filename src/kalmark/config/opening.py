@@ -7,15 +7,17 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from kalmark.config.images import complete, with_images
 from kalmark.config.reading import ENDINGS, config_of, did_you_mean, resolve_config, shipped_configs
 from kalmark.config.schema import COMMON, TRUTH, Config
 from kalmark.config.tree import EACH, OVERRIDE, Tree, merge_trees, read_tree, tree_of, with_each
 from kalmark.errors import ConfigError, LogError
-from kalmark.events import Frame, Scan
+from kalmark.events import Raw, Scan
 from kalmark.logs import find_data, known_formats, open_log
 from kalmark.logs.formats import recognise
 from kalmark.logs.log import Log
+from kalmark.plugins import load
+
+OF_PLUGINS = ("images",)  # keys of sensors of which a plug-in knows what they do
 
 
 def open_run(
@@ -38,10 +40,13 @@ def open_run(
     refuse_idle(tree, log)
     resolve_each(tree, log)
     whole = overlay_on_log(tree, log)
-    complete(whole)
+    parts = [load("keys", name) for name in OF_PLUGINS if any(path[-1] == name for path in whole.places if path)]
+    for part in parts:
+        part.complete(whole)
     config = config_of(whole, path)
     found = {"known": str(known_map_path(config))} if config.map.known not in (None, TRUTH) else {}
-    log = with_images(config, log)
+    for part in parts:
+        log = part.with_events(config, log)
     return config.model_copy(update={"log": alone.log, "map": config.map.model_copy(update=found)}), log
 
 
@@ -185,7 +190,7 @@ def resolve_each(tree: Tree, log: Log) -> None:
     """Let ``sensors.each`` stand for the log's sensors; leave ``robots.each`` out where all robots have entries."""
     for node, path in with_each(tree.values):
         if path[-1] == "sensors":
-            scans = (e for e in log.events if isinstance(e, Scan | Frame) and path[1] in (e.robot, EACH))
+            scans = (e for e in log.events if isinstance(e, Scan | Raw) and path[1] in (e.robot, EACH))
             for sensor in sorted({scan.sensor for scan in scans} - node.keys()):
                 tree.share(node, path, sensor)
         if path[-1] == "sensors" or all(name in node for name in log.robots):

@@ -40,7 +40,8 @@ from kalmark.declare import (
 from kalmark.errors import ModelError
 from kalmark.events import MOST, is_number
 from kalmark.models.protocols import has_second_camera
-from kalmark.tracks.front_ends import SearchingDetector
+from kalmark.plugins import entry_points_of, load
+from kalmark.slam.sources import SearchingDetector
 
 FAR = MOST["m"]
 Number = Annotated[float, Field(ge=-FAR, le=FAR, allow_inf_nan=False)]
@@ -180,15 +181,15 @@ class Choice:
 
 
 class OneOf(Choice):
-    """One of some sections, by their `type`."""
+    """One of some sections, by their `type`, or of a `group` of entry points."""
 
-    def __init__(self, *sections: type[Section]) -> None:
-        self.typed, self.default = True, None
+    def __init__(self, *sections: type[Section], group: str = "") -> None:
+        self.typed, self.default, self.group = True, None, group
         self.sections: dict[str, type[Section]] = {str(s.model_fields["type"].default): s for s in sections}
 
     def names(self) -> list[str]:
         """Return the types there are."""
-        return [*self.sections]
+        return [*self.sections, *entry_points_of(self.group)]
 
     def has(self, name: str) -> bool:
         """Return whether there is a type."""
@@ -196,7 +197,8 @@ class OneOf(Choice):
 
     def made(self, name: str, value: Any) -> Section:
         """Return the section of a mapping."""
-        return self.sections[name].model_validate(value)
+        section: type[Section] = self.sections.get(name) or load(self.group, name)
+        return section.model_validate(value)
 
 
 def finds(detector: Any, sensor: Any) -> bool:

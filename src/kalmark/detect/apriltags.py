@@ -10,7 +10,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import Positive, register
 from kalmark.errors import EventError, ModelError
-from kalmark.events import Frame, Scan, label_of_event
+from kalmark.events import Frame, Raw, Scan, label_of_event
 from kalmark.models.sensors import TagCorners
 
 Family = Literal["16h5", "25h9", "36h10", "36h11"]
@@ -34,6 +34,7 @@ class Tags:
     """Tags of one family and one size, by the pixels of their corners, as a `TagCorners` sensor takes them."""
 
     columns: ClassVar[tuple[str, ...]] = TagCorners.columns
+    takes: ClassVar[type[Raw]] = Frame
 
     family: Annotated[Family, "Family of the tags."] = "36h11"
     size_m: Annotated[Positive, "Length of a side of the black square."] = 0.1

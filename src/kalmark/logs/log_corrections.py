@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Scan, sort_key
+from kalmark.events import Control, Event, Fix, Raw, Scan, sort_key
 from kalmark.logs.log import Log
 from kalmark.logs.source import quantity, spelling_hint
 
@@ -84,7 +84,7 @@ def _event(event: Event, factors: Mapping[Path_, Array], late: Mapping[Path_, fl
         return event_at_time(event, t_ns)
     path = (event.robot,) if isinstance(event, Control) else (event.robot, event.sensor)
     t_ns += round(late.get(path, 0.0) * 1e9)
-    if isinstance(event, Frame):
+    if isinstance(event, Raw):
         return event_at_time(event, t_ns)
     by = factors.get(path, np.ones(1))
     cov = None if event.cov is None else event.cov * np.outer(by, by)

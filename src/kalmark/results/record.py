@@ -13,7 +13,7 @@ from numba.core import event as numba_event
 from kalmark.arrays import Array
 from kalmark.declare import is_own, registered_name
 from kalmark.errors import DivergedError, EventError, ImageError, LogError
-from kalmark.events import Control, Event, Fix, Frame, Scan
+from kalmark.events import Control, Event, Fix, Frame, Raw, Scan
 from kalmark.logs.log import Log, begins_at
 from kalmark.logs.progress import track
 from kalmark.logs.source import spelling_hint
@@ -138,6 +138,14 @@ class DeadReckoning:
         return self.state if self.started else np.full_like(self.state, np.nan)
 
 
+def _steps(kinds: set[type]) -> tuple[str, Any]:
+    """Return the events that end the steps of a log with these kinds of events: their name, and their kinds."""
+    for name, some in (("scan", Scan | Raw), ("fix", Fix)):
+        if any(issubclass(kind, some) for kind in kinds):
+            return name, some
+    return "control", Control
+
+
 class _Recorder:
     """Gathers one run; `process` is the hot path, everything is put in order afterwards by `run`."""
 
@@ -145,9 +153,8 @@ class _Recorder:
         self.slam, self.log, self.pictures = slam, log, pictures
         kinds = {type(event) for event in log.events}
         self.has_images = Frame in kinds
-        steps: tuple[tuple[str, set[type]], ...] = (("scan", {Scan, Frame}), ("fix", {Fix}), ("control", {Control}))
-        self.stepped_by, self.stepped = next((step for step in steps if step[1] & kinds), steps[-1])
-        scans = sum(type(e) in self.stepped for e in log.events)
+        self.stepped_by, self.stepped = _steps(kinds)
+        scans = sum(isinstance(e, self.stepped) for e in log.events)
         self.snapshot_at = np.linspace(0, scans - 1, SNAPSHOTS if pictures else 0)
         self.expectations = ExpectationRecorder(
             slam, scans if pictures else 0, np.floor(self.snapshot_at).astype(int).tolist()
@@ -211,9 +218,9 @@ class _Recorder:
             mine = [each for scan, each in of if (scan.robot, scan.sensor) == (event.robot, event.sensor)]
             before = sum(o.outcome == "associated" for each in mine for o in each.observations)
             self.placed.append(RelocatedRobot(event.t_ns, event.robot, event.sensor, report.replaced, before))
-        if type(event) not in self.stepped:
+        if not isinstance(event, self.stepped):
             return
-        scan = report.event  # of a frame, what its detector found
+        scan = report.event  # of raw data, what the detector found
         if not isinstance(scan, Scan):
             scan = Scan(t_ns=event.t_ns, robot=event.robot)
             report = Report(scan)  # a step without observations

@@ -1,16 +1,17 @@
 """Layouts of landmarks of a simulated world: Sola's cloister ([S] App. C), a loop, a random field, a list.
 
 Layouts of the plane serve robots of space as well: their landmarks are at z = 0.  Those of space are the toolbox's
-thick cloister and house ([TB] `thickCloister`, `house`), a random box, a room of tags and planes with textures.
+thick cloister and house ([TB] `thickCloister`, `house`), a random box, a room of tags.  Plug-ins may
+have others (`kalmark.layouts`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.random import Generator
@@ -18,11 +19,10 @@ from pydantic import AfterValidator, Field, model_validator
 
 from kalmark.arrays import Array
 from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, unexpected_value
-from kalmark.geometry.frames3d import from_euler_pose, from_frame
-from kalmark.simulate.rendering import Rectangle, texture
+from kalmark.events import Raw
+from kalmark.geometry.frames3d import from_euler_pose
 
 TOUCH_M = 1e-3  # walls this near to each other meet
-PANEL_M = 0.4, 1.0  # width and height of a panel
 STRAIGHT = 0.05  # sine of an angle between walls, below which they make no corner
 
 Count = Annotated[int, Field(ge=1)]
@@ -48,24 +48,33 @@ Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)
 class Scenery:
     """The landmarks of a world: points (N, 2|3), segments (S, 6) from end to end, tags (T, 7) as poses, in m.
 
-    In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags.  `planes` have textures,
-    for cameras whose images are rendered.
+    In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags.
+
+    `raw_of`, of a plug-in's layout, returns of a sensor and its `sensing` what makes its raw data from its pose (7,),
+    the time in ns, the names of robot and sensor, and a seed.  What they show is between the `corners` (N, 3).
     """
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))
     segments: Array = field(default_factory=lambda: np.empty((0, 6)))
     tags: Array = field(default_factory=lambda: np.empty((0, 7)))
     tag_sizes: Array = field(default_factory=lambda: np.empty(0))
-    planes: tuple[Rectangle, ...] = ()
+    corners: Array = field(default_factory=lambda: np.empty((0, 3)))
+    raw_of: Callable[[Any, Any], Callable[[Array, int, str, str, int], Raw]] | None = None
 
     @property
     def of_space(self) -> bool:
         """True if it cannot be in the plane."""
         solid = bool(len(self.segments)) and self.segments.shape[1] == 6
-        return self.points.shape[1] == 3 or solid or bool(len(self.tags)) or bool(self.planes)
+        return self.points.shape[1] == 3 or solid or bool(len(self.tags)) or self.raw_of is not None
 
 
-class OfPoints(Section):
+class LayoutSection(Section):
+    """A layout; `gives_raw` are the types of sensors whose raw data it can give."""
+
+    gives_raw: ClassVar[tuple[str, ...]] = ()
+
+
+class OfPoints(LayoutSection):
     """A layout that places points alone."""
 
     def place(self, rng: Generator) -> Array:
@@ -180,7 +189,7 @@ class ThickCloister(WallLayout):
         return np.vstack([np.column_stack([floor, np.full(len(floor), z)]) for z in (0.0, self.height_m)])
 
 
-class House(Section):
+class House(LayoutSection):
     """A house of 23 segments: walls, a roof, a door and a window in the western wall.  [TB] `house`."""
 
     type: Literal["house"] = "house"
@@ -249,7 +258,7 @@ def pose_at_wall(
     return from_euler_pose(np.array([*place, -math.pi / 2, 0.0, math.pi / 2 * (1 - wall) + turned]))[0]
 
 
-class TagRoom(Section):
+class TagRoom(LayoutSection):
     """A room with tags on its four walls, all facing inwards; its south-western corner is the origin."""
 
     type: Literal["tag_room"] = "tag_room"
@@ -287,7 +296,7 @@ def wall_corners(walls: Array) -> Array:
     return np.array(found).reshape(-1, 2)
 
 
-class _Placed(Section):
+class Placed(Section):
     """A pose: x to the right of a viewer, y down, z away from the viewer."""
 
     x_m: Number = 0.0
@@ -309,14 +318,14 @@ class _Placed(Section):
         return from_euler_pose(np.array([self.x_m, self.y_m, self.z_m, *turns]))[0]
 
 
-class ListedTag(_Placed):
+class ListedTag(Placed):
     """A tag: x to the right of a viewer, y down, z away from the viewer, into the wall behind it."""
 
     size_m: Positive = 0.3
     """Its side."""
 
 
-class Listed(Section):
+class Listed(LayoutSection):
     """Landmarks at given places: points, segments, tags; walls of the plane, whose corners are points."""
 
     type: Literal["list"] = "list"
@@ -352,7 +361,7 @@ class Listed(Section):
         return Scenery(points, segments, tags, np.array([tag.size_m for tag in self.tags]))
 
 
-class Empty(Section):
+class Empty(LayoutSection):
     """No landmark: for sensors of the robot itself."""
 
     type: Literal["empty"] = "empty"
@@ -362,80 +371,6 @@ class Empty(Section):
         return Scenery(np.empty((0, 2)))
 
 
-class ListedPlane(_Placed):
-    """A rectangle with a random texture; its axes are those of a tag."""
-
-    width_m: Positive = 1.0
-    """Along x."""
-    height_m: Positive = 1.0
-    """Along y."""
-
-
-class _Textured(Section):
-    """Planes with random textures."""
-
-    pixel_m: Positive = 0.005
-    """A pixel of the textures."""
-    per_m2: Positive = 60.0
-    """Quadrangles of random grey values in a square metre, 2 to 40 cm wide."""
-
-    def textured(self, planes: Iterable[tuple[Array, float, float]], rng: Generator) -> Scenery:
-        """Return planes of these middles (7,), widths and heights [m]."""
-        out = []
-        for middle, width, height in planes:
-            drawn = texture(width, height, self.pixel_m, rng, self.per_m2)
-            rows, columns = drawn.shape
-            corner = np.array([-0.5 * columns * self.pixel_m, -0.5 * rows * self.pixel_m, 0.0])
-            pose = middle.copy()
-            pose[:3] = from_frame(middle, corner)[0]
-            out.append(Rectangle(pose, drawn, self.pixel_m))
-        return Scenery(planes=tuple(out))
-
-
-class TexturedPlanes(_Textured):
-    """Planes with random textures, for cameras whose images are rendered."""
-
-    type: Literal["textured_planes"] = "textured_planes"
-    planes: Annotated[tuple[ListedPlane, ...], Field(strict=False, min_length=1)]
-    """Their middles and sizes."""
-
-    def scenery(self, rng: Generator) -> Scenery:
-        """Return the planes with random textures."""
-        return self.textured(((plane.pose(), plane.width_m, plane.height_m) for plane in self.planes), rng)
-
-
-class TexturedRoom(_Textured):
-    """A room with random textures on floor, walls and panels, for cameras whose images are rendered.
-
-    Its south-western corner is the origin.
-    """
-
-    type: Literal["textured_room"] = "textured_room"
-    length_m: Positive = 6.0
-    """From west to east."""
-    width_m: Positive = 5.0
-    """From south to north."""
-    height_m: Positive = 3.0
-    """Of the walls."""
-    panels: Annotated[int, Field(ge=0)] = 8
-    """Upright panels of 0.4 to 1 m, turned at random, up to `panel_depth_m` before a random wall."""
-    panel_depth_m: Positive = 1.0
-    """The largest distance of a panel from its wall."""
-
-    def scenery(self, rng: Generator) -> Scenery:
-        """Return the floor, the walls and the panels, with random textures."""
-        size, top = (self.length_m, self.width_m), self.height_m
-        floor = from_euler_pose(np.array([size[0] / 2, size[1] / 2, 0.0, math.pi, 0.0, 0.0]))[0]
-        planes = [(floor, *size)]
-        planes += [(pose_at_wall(size, wall, 0.0, 0.0, top / 2), size[1 - wall % 2], top) for wall in range(4)]
-        for wall in rng.integers(0, 4, self.panels).tolist():
-            width, height = rng.uniform(*PANEL_M, 2).tolist()
-            z = rng.uniform(height / 2, max(height, top - height / 2))
-            off, y, turned = rng.uniform((0.3, -0.8, -0.6), (1.0, 0.8, 0.6)).tolist()
-            planes.append((pose_at_wall(size, wall, self.panel_depth_m * off, y, z, turned), width, height))
-        return self.textured(planes, rng)
-
-
 Layout = Annotated[Any, OneOf(
-    Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed, Empty, TexturedPlanes, TexturedRoom,
+    Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed, Empty, group="layouts"
 )]  # fmt: skip

@@ -9,9 +9,8 @@ biases, scales, radii.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +20,7 @@ from numpy.random import Generator, SeedSequence
 from kalmark.arrays import Array
 from kalmark.config.building import build_robot
 from kalmark.detect.laser_scan import RAW, Laser
-from kalmark.events import Control, Event, Frame, Id, Scan, seconds_text, sort_key
+from kalmark.events import Control, Event, Id, Raw, Scan, seconds_text, sort_key
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
@@ -44,13 +43,11 @@ from kalmark.models.protocols import (
     tells_velocity,
     true_control,
 )
-from kalmark.models.sensors import PixelDepth, Stereo
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, view_of_state
 from kalmark.models.velocity_view import velocity_of
 from kalmark.simulate import laser, sights
 from kalmark.simulate.layouts import Scenery
-from kalmark.simulate.rendering import Rectangle, Renderer, render, rendered_depth
 from kalmark.simulate.routes import Driver
 from kalmark.simulate.sights import POINTS, Sighted, SimulatedSensing, Things, gaussian, things_in_frame
 from kalmark.simulate.worlds import World
@@ -65,14 +62,14 @@ WILD = 30.0  # by so many of its own errors an outlier of a sensor of the state 
 class SimSensor:
     """A sensor, where it truly sits, and what is wrong with it; `laser` is the detector of one whose scans are raw.
 
-    `renderer` makes the images of a camera that gives images.
+    `raw` makes the raw data of one that gives no measurements.
     """
 
     sensor: Any
     at: Array
     sensing: SimulatedSensing
     laser: Laser | None = None
-    renderer: Renderer | None = None
+    raw: Callable[..., Raw] | None = None
     walked: int = 0  # the step up to which its constants have walked
     last: tuple[int, Array] | None = None  # step and robot's pose of the last reading or scan
     kept: dict[int, Array] = field(default_factory=dict)  # of an odometer that closes loops: poses by steps,
@@ -146,7 +143,7 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
     scenery = world.world.scenery(chance.layout)
     things = things_in(world, scenery, chance.layout)
     area = area_of(scenery, things)
-    robots = [sim_robot(world, name, area, chance, scenery.planes) for name in world.robots]
+    robots = [sim_robot(world, name, area, chance, scenery) for name in world.robots]
     times = [round(k * world.dt_s * 1e9) for k in range(world.steps + 1)]
     events: list[Event] = []
     origins: dict[Key, tuple[Id | None, ...]] = {}
@@ -161,7 +158,7 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
             for scan, real in sensor_scans(robot, robots, things, world, k, now, chance):
                 events.append(scan)
                 origins[now, scan.robot, scan.sensor] = real
-            events += camera_frames(robot, k, now, chance)
+            events += raw_data(robot, k, now, chance)
     states = {r.name: np.array([*r.states, r.state]) for r in robots}
     log = Log(
         world.name, tuple(world.robots), sorted(events, key=sort_key), "simulated",
@@ -193,7 +190,7 @@ def things_in(world: World, scenery: Scenery, rng: Generator) -> dict[str, Thing
 def area_of(scenery: Scenery, things: dict[str, Things]) -> Array:
     """Return the lower and the upper corner of all there is (2, D)."""
     places = [sort.centres() for sort in things.values() if len(sort.values)]
-    places += [plane.corners() for plane in scenery.planes]
+    places += [scenery.corners] if len(scenery.corners) else []
     centres = np.concatenate(places or [np.zeros((1, things[POINTS].values.shape[1]))])
     return np.array([centres.min(axis=0), centres.max(axis=0)])
 
@@ -205,10 +202,10 @@ def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
     return {i: row.copy() for s, t in things.items() for i, row in enumerate(rows[s], t.first)}
 
 
-def sim_robot(world: World, name: str, area: Array, chance: Chance, planes: Sequence[Rectangle] = ()) -> SimRobot:
+def sim_robot(world: World, name: str, area: Array, chance: Chance, scenery: Scenery) -> SimRobot:
     """Put a robot at its start and its sensors on their mounts, drawn around configured values with sigmas.
 
-    `area` (2, D) has the lower and the upper corner of the world, `planes` are those of which images are rendered.
+    `area` (2, D) has the lower and the upper corner of the world, `scenery` may have raw data for them.
     """
     simulated = world.robots[name]
     robot = build_robot(world.models(), name)
@@ -216,9 +213,10 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance, planes: Sequ
     sensors = {}
     for key, mount in robot.sensors.items():
         sensing = simulated.sensing.get(key, SimulatedSensing()).of(simulated.sensors[key], world.dt_s)
-        raw = mount.detector if isinstance(mount.detector, Laser) else None
+        laser = mount.detector if isinstance(mount.detector, Laser) else None
         true, at = draw_mount(mount, chance.mounts)
-        sensors[key] = SimSensor(true, at, sensing, raw, Renderer(planes, true) if sensing.images else None)
+        raw = scenery.raw_of(true, sensing) if scenery.raw_of is not None and sensing.images else None
+        sensors[key] = SimSensor(true, at, sensing, laser, raw)
     driver = simulated.route.driver(robot.motion, world.dt_s, area, chance.route)
     model = self_calibrating(robot.motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
@@ -299,7 +297,7 @@ def sensor_scans(
     """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
     found: list[tuple[Scan, tuple[Id | None, ...]]] = []
     for name, carried in robot.sensors.items():
-        if carried.renderer is not None or not carried.sensing.scans_at(k):
+        if carried.raw is not None or not carried.sensing.scans_at(k):
             continue
         if isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
             continue
@@ -336,34 +334,27 @@ def sensor_scans(
     return found
 
 
-def camera_frames(robot: SimRobot, k: int, t_ns: int, chance: Chance) -> list[Frame]:
-    """Return the frames of a robot's cameras that give images, from its true pose at step k."""
+def raw_data(robot: SimRobot, k: int, t_ns: int, chance: Chance) -> list[Raw]:
+    """Return the raw data of a robot's sensors that give them, from its true pose at step k."""
     return [
-        take_frame(robot, name, carried, carried.renderer, t_ns, chance)
+        raw_of(robot, name, carried.raw, t_ns, chance)
         for name, carried in robot.sensors.items()
-        if carried.renderer is not None and carried.sensing.scans_at(k)
+        if carried.raw is not None and carried.sensing.scans_at(k)
     ]
 
 
-def take_frame(robot: SimRobot, name: str, carried: SimSensor, renderer: Renderer, t_ns: int, chance: Chance) -> Frame:
-    """Return the frame of a camera from its robot's true pose, rendered when its pixels are needed."""
-    T, sensing, seed = sensor_pose(robot.pose, carried.at)[0], carried.sensing, int(chance.sight.integers(2**62))
-    image = partial(render, renderer, T, seed, sensing.noise_grey, sensing.blur_px)
-    sigma = carried.sensor.sigma_rho_per_m if isinstance(carried.sensor, PixelDepth) else 0.0
-    depth = partial(rendered_depth, renderer, T, seed + 1, sigma) if sensing.depth else None
-    right = None
-    if isinstance(carried.sensor, Stereo):
-        beside = sensor_pose(T, np.array([carried.sensor.baseline_m, 0, 0, 0, 0, 0, 1.0]))[0]
-        right = partial(render, renderer, beside, seed + 2, sensing.noise_grey, sensing.blur_px)
-    return Frame(t_ns=t_ns, robot=robot.name, sensor=name, image=image, depth=depth, right=right)
+def raw_of(robot: SimRobot, name: str, make: Callable[..., Raw], t_ns: int, chance: Chance) -> Raw:
+    """Return the raw data of a sensor, as its scene makes them, from its robot's true pose."""
+    T, seed = sensor_pose(robot.pose, robot.sensors[name].at)[0], int(chance.sight.integers(2**62))
+    return make(T, t_ns, robot.name, name, seed)
 
 
 def first_event(robot: SimRobot, name: str, chance: Chance) -> Event:
-    """Return the first event of a robot that moves without controls: an empty scan of a sensor, or its first image."""
-    carried = robot.sensors[name]
-    if carried.renderer is None:
+    """Return the first event of a robot that moves without controls: an empty scan of a sensor, or raw data."""
+    make = robot.sensors[name].raw
+    if make is None:
         return Scan(t_ns=0, robot=robot.name, sensor=name)
-    return take_frame(robot, name, carried, carried.renderer, 0, chance)
+    return raw_of(robot, name, make, 0, chance)
 
 
 def sensor_velocity(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:

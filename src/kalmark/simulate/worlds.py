@@ -27,13 +27,13 @@ from kalmark.config.schema import (
 )  # fmt: skip
 from kalmark.config.sections import Positive, Section, model_of, unexpected_value
 from kalmark.config.tree import Tree, merge_trees, read_tree
-from kalmark.simulate.layouts import Layout, TexturedPlanes, TexturedRoom
+from kalmark.plugins import entry_points_of
+from kalmark.simulate.layouts import Layout
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import SimulatedSensing
 from kalmark.slam.description import plain_value
 
 Count = Annotated[int, Field(ge=1)]
-IMAGING = ("pinhole", "pixel_depth", "stereo", "omnidirectional")  # the types of sensors whose images can be rendered
 
 
 class _Underway(Section):
@@ -54,10 +54,6 @@ class _Underway(Section):
         for name in self.sensing:
             if name not in robot.sensors:
                 raise unexpected_value(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
-            if self.sensing[name].images and robot.sensors[name].type not in IMAGING:
-                raise unexpected_value(
-                    f"images of {' or '.join(IMAGING)}, not of {name!r}, a {robot.sensors[name].type}"
-                )
             if self.sensing[name].loop_reach_m is not None and getattr(robot.sensors[name], "keep", 1) == 1:
                 raise unexpected_value(f"loop_reach_m of an odometer whose keep is 0, or 2 or more, not of {name!r}")
         return self
@@ -121,9 +117,14 @@ class World(OfFile):
             raise unexpected_value("sight_robots false where a sensor measures signatures: robots have none")
         if len({type(robot) for robot in self.robots.values()}) > 1:
             raise unexpected_value("robots that all move in the plane, or all in space")
-        pictures = any(sensing.images for robot in self.robots.values() for sensing in robot.sensing.values())
-        if pictures and not isinstance(self.world, TexturedPlanes | TexturedRoom):
-            raise unexpected_value("images in a world of textures, textured_room or textured_planes")
+        for robot in self.robots.values():
+            for sensor in (name for name, sensing in robot.sensing.items() if sensing.images):
+                of = self.world.gives_raw
+                if not of:
+                    worlds = " or ".join(entry_points_of("layouts"))
+                    raise unexpected_value(f"images in a world that has them: {worlds}")
+                if (kind := robot.sensors[sensor].type) not in of:
+                    raise unexpected_value(f"images of {' or '.join(of)}, not of {sensor!r}, a {kind}")
         if self.dimensions == 2 and self.world.scenery(np.random.default_rng(0)).of_space:
             raise unexpected_value("robots of space, or a world of the plane: its landmarks are in space")
         return self

@@ -25,7 +25,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import ModelError
-from kalmark.events import Control, Event, Frame, Scan
+from kalmark.events import Control, Event, Raw, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState, TimedNoise, coasts
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
@@ -145,7 +145,7 @@ class Standing:
         """Take an event of the robot; return whether it stood in the window that ends with it, None within one."""
         name = event.sensor if isinstance(event, Scan) else CONTROLS
         source = self.sources.get(name)
-        if source is None or isinstance(event, Frame) or (isinstance(event, Scan) and not len(event.y)):
+        if source is None or isinstance(event, Raw) or (isinstance(event, Scan) and not len(event.y)):
             return None
         if isinstance(event, Control):
             source.take(event.t_ns, event.u, control_covariance(self.motion, event))

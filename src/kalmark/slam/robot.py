@@ -31,8 +31,8 @@ from kalmark.models.protocols import (
 )
 from kalmark.slam.checks import check_covariance, instance, refuse_odd_association, require_methods
 from kalmark.slam.gaps import ACTIONS, Gaps
+from kalmark.slam.sources import SearchingDetector
 from kalmark.tracks.channel import ROBUST
-from kalmark.tracks.front_ends import SearchingDetector
 
 INFINITE = math.inf
 IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
@@ -96,7 +96,7 @@ class Mount:
         if self.detector is not None:
             searches = isinstance(self.detector, SearchingDetector)
             one = "an object like km.detect.Trunks(), or a function"
-            require_methods(self.detector, ("front_end" if searches else "__call__",), "Mount: detector", one)
+            require_methods(self.detector, ("source" if searches else "__call__",), "Mount: detector", one)
             declared = {own.name for own in parameters(type(self.detector))}
             if "signature" in declared and vars(self.detector)["signature"] is None:
                 chosen: Any = replace(self.detector, signature="signature" in self.sensor.columns)  # type: ignore[type-var]

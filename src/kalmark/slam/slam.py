@@ -33,8 +33,8 @@ from kalmark.events import (
     Control,
     Event,
     Fix,
-    Frame,
     Id,
+    Raw,
     Scan,
     checked_id,
     kind_of,
@@ -48,7 +48,7 @@ from kalmark.management import reparametrize as points
 from kalmark.management.attention import reasons_against_start
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.landmarks import Point2D
-from kalmark.models.protocols import Landmark, UnknownDepth
+from kalmark.models.protocols import Landmark
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import by_ids, locating, maintenance, moves, starting, state_corrections, tentative
 from kalmark.slam.checks import check_covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
@@ -59,9 +59,9 @@ from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy, refuse_other_world
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.robot import Robot, robots_given
+from kalmark.slam.sources import RawDetector, Replay, Source
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import CURE, Settings, State
-from kalmark.tracks.front_ends import FrameDetector, FrontEnd, SearchingDetector
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track
 
@@ -114,7 +114,7 @@ class Slam(Estimate):
         super().__init__(State(by_name, settings))
         self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may call `expect`
         self._ahead: list[int] = []  # times of the events in a row that came too far ahead
-        self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Frame: self._frame, Fix: self._fix}
+        self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
         if isinstance(estimator, CompilingEstimator):
             kinds = [kind for channel in self.state.channels.values() for kind in channel.landmark.space.kinds]
             axes = max(robot.motion.space.axes for robot in by_name.values())
@@ -134,9 +134,10 @@ class Slam(Estimate):
 
         Raises EventError for an event that cannot be used, DivergedError when a robot is lost for good.
         """
-        state, take = self.state, self._takes.get(type(event))
+        state, is_raw = self.state, isinstance(event, Raw)
+        take: Any = self._raw if is_raw else self._takes.get(type(event))
         if take is None:
-            raise EventError(f"got {type(event).__name__}, expected a Control, a Scan, a Frame or a Fix")
+            raise EventError(f"got {type(event).__name__}, expected a Control, a Scan, a Fix or raw data of a sensor")
         before = state.t_ns
         if before is not None and event.t_ns < before:
             raise EventError(f"{label_of_event(event)} comes after one at t={seconds_text(before)} s")
@@ -147,7 +148,7 @@ class Slam(Estimate):
             self._refuse_ahead(event, before)
         try:
             report: Report = take(event)
-            if not isinstance(event, Frame):
+            if not is_raw:
                 state.settle()
             if event.robot in state.standing:
                 report.standing = state_corrections.correct_by_rest(state, event)
@@ -206,31 +207,28 @@ class Slam(Estimate):
         policy = self._policy(event)
         return self._found(event if policy.detector is None else policy.detector(event))
 
-    def _frame(self, event: Frame) -> Report:
-        state, detector = self.state, self._policy(event).detector
-        if isinstance(detector, SearchingDetector):
-            return self._searched(event, state.front_ends[event.robot, event.sensor])
-        if not isinstance(detector, FrameDetector):
-            raise EventError(f"{label_of_event(event)}: {event.sensor!r} has no detector for images, expected one")
-        return self._found(detector.scan_of(event))
+    def _raw(self, event: Raw) -> Report:
+        """Take what a detector, or the source of a sensor, finds in raw data."""
+        source, detector = self.state.sources.get((event.robot, event.sensor)), self._policy(event).detector
+        if source is not None and isinstance(event, source.takes):
+            return self._searched(event, source)
+        if isinstance(detector, RawDetector) and isinstance(event, detector.takes):
+            return self._found(detector.scan_of(event))
+        kind = type(event).__name__.lower()
+        raise EventError(f"{label_of_event(event)}: {event.sensor!r} has no detector for a {kind}, expected one")
 
-    def _searched(self, event: Frame, front_end: FrontEnd) -> Report:
-        """Search a frame for the landmarks that are expected in it.  [S] 2.4."""
-        if front_end.waits and self.state.begins:
+    def _searched(self, event: Raw, source: Source) -> Report:
+        """Search raw data for the landmarks that are expected in them.  [S] 2.4."""
+        state, key = self.state, (event.robot, event.sensor)
+        if source.waits and state.begins:
             return self._found(Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor))
-        state, channel, image = self.state, self.state.channels[event.robot, event.sensor], event.grey()
-        pair = channel.of_pair
-        beside = event.right_grey() if pair else event.depths() if channel.finds_depth else None
-        if beside is not None and beside.shape != image.shape:
-            what = "right image is" if pair else "depths are"
-            raise EventError(f"{label_of_event(event)}: the {what} {beside.shape}, expected {image.shape} as the image")
+        data = source.read(event)
         state.t_ns = event.t_ns
         gaps = moves.advance(state, event.robot)
-        again = front_end.recognised(image, state.map, state.tracks, channel)
+        again = source.located(data, state.view(key))
         if again is not None:
-            locating.relocate_robot(state, channel, event.robot, *again)
-        prospect = front_end.prospect_of(state.map, state.tracks, channel, event.robot)
-        scan, removed, drifted = front_end.search(event, image, prospect, beside)
+            locating.relocate_robot(state, state.channels[key], event.robot, *again)
+        scan, removed, drifted = source.found(event, data, state.view(key))
         if drifted is not None:
             locating.inflate_covariance(state, event.robot, *drifted)
         for name, _ in removed:
@@ -238,31 +236,29 @@ class Slam(Estimate):
         report = self._found(scan)
         report.gaps += gaps
         report.removed = (*removed, *report.removed)
-        front_end.update(report, channel.pose(state.map, state.moving[event.robot].slot))
-        if isinstance(channel.landmark, UnknownDepth) and channel.landmark.prior_rho_per_m > 0.0:
-            begun = front_end.frames_to_filter_again(channel.landmark.prior_rho_per_m)
-            if begun is not None:
-                self._begin_again(front_end, *begun)
+        replay = source.update(report, state.view(key))
+        if replay is not None:
+            self._begin_again(source, replay)
         return report
 
-    def _begin_again(self, front_end: FrontEnd, scans: list[tuple[Scan, list[Id]]], rho: dict[Id, float]) -> None:
-        """Filter all frames so far again, landmarks starting at the inverse distances that are known now."""
+    def _begin_again(self, source: Source, replay: Replay) -> None:
+        """Filter all scans of a source so far again, landmarks starting at the inverse distances that are known now."""
         again = Slam(self.robots.values(), **vars(self.state.settings))
-        state, key, poses = again.state, (scans[0][0].robot, scans[0][0].sensor), []
+        state, key, poses = again.state, (replay.scans[0][0].robot, replay.scans[0][0].sensor), []
         channel = state.channels[key]
-        channel.rho = rho
-        for scan, removed in scans:
+        channel.rho = replay.rho
+        for scan, removed in replay.scans:
             for name in removed:
                 if name in state.tracks.confirmed:
                     state.remove(name)
             again._found(scan)
-            poses.append(channel.pose(state.map, state.moving[key[0]].slot))
+            poses.append(state.view(key).T)
         channel.rho = {}
-        front_end.replace_poses(poses, state.tracks.confirmed.keys())
-        state.front_ends = self.state.front_ends
+        source.replace_poses(poses, state.tracks.confirmed.keys())
+        state.sources = self.state.sources
         self.state = state
 
-    def _policy(self, event: Scan | Frame) -> Policy:
+    def _policy(self, event: Scan | Raw) -> Policy:
         """Return the policy for what a sensor of landmarks saw.  Raises EventError."""
         policy = self.state.policies.get((event.robot, event.sensor))
         if policy is None:
@@ -421,8 +417,8 @@ class Slam(Estimate):
         if cov is not None:
             cov = check_covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         state.settle()
-        for front_end in state.front_ends.values():
-            front_end.survey(name)
+        for source in state.sources.values():
+            source.survey(name)
         state.tracks.reserve([name])
         state.placed = NEEDED
         if cov is None and not any(policy.averages for policy in state.policies.values()):

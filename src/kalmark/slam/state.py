@@ -26,9 +26,9 @@ from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, polic
 from kalmark.slam.reader import LEAST_S, StateReader
 from kalmark.slam.rests import rest_detector
 from kalmark.slam.robot import Robot, mount_name
+from kalmark.slam.sources import FilterView, SearchingDetector, Source
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
-from kalmark.tracks.front_ends import FrontEnd, SearchingDetector
 from kalmark.tracks.scan import Start
 from kalmark.tracks.surveys import Surveys
 from kalmark.tracks.track import ChannelKey, Tracks
@@ -72,14 +72,14 @@ class State:
     moving: dict[str, Moving]
     alternatives: dict[str, Alternative]
     sums: dict[str, GaussianSum]
-    front_ends: dict[ChannelKey, FrontEnd]
+    sources: dict[ChannelKey, Source]
     readers: dict[ChannelKey, StateReader]
 
     def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
         self.settings, self.robots, self.t_ns, self.taken, self.placed = settings, robots, None, set(), 0
         self.map, self.tracks = new_map(settings.map, settings.numbers), Tracks(robots)
         self.clones, self.surveys, self.given, self.alternatives, self.sums = Clones(), Surveys(), {}, {}, {}
-        self.moving, self.front_ends, self.readers = {}, {}, {}
+        self.moving, self.sources, self.readers = {}, {}, {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
         self.standing: dict[str, str] = {}
@@ -89,15 +89,15 @@ class State:
         for robot in robots.values():
             self._place(robot, kinds)
         self.blocks = len(self.tracks.slots)  # the first of the map: they stay
-        alone = [front_end for front_end in self.front_ends.values() if not front_end.waits]
-        if len(robots) == 1 and len(alone) == 1 and len(self.front_ends) == len(next(iter(robots.values())).sensors):
-            alone[0].watch_beginning()
+        first = [source for source in self.sources.values() if not source.waits]
+        if len(robots) > 1 or len(first) > 1 or len(self.sources) < len(next(iter(robots.values())).sensors):
+            self.settle()
         self.may_grow = settings.map == "auto" and not any(policy.averages for policy in self.policies.values())
 
     @property
     def begins(self) -> bool:
-        """True if a front end still keeps the first frames, which alone are to move the map."""
-        return any(front_end.beginning is not None for front_end in self.front_ends.values())
+        """True if a source still keeps its first scans, which alone are to move the map."""
+        return any(source.begins for source in self.sources.values())
 
     @property
     def estimator(self) -> Estimator:
@@ -137,9 +137,13 @@ class State:
             )  # fmt: skip
             self.channels[robot.name, name] = channel
             if isinstance(mount.detector, SearchingDetector):
-                self.front_ends[robot.name, name] = mount.detector.front_end(mount.sensor)
+                self.sources[robot.name, name] = mount.detector.source(mount.sensor)
             upkeep = mount.upkeep or settings.upkeep
             self.policies[robot.name, name] = policy_of(mount, channel, association, upkeep, settings.reparametrize)
+
+    def view(self, key: ChannelKey) -> FilterView:
+        """Return what the source of a channel reads."""
+        return FilterView(self.map, self.tracks, self.channels[key], key[0])
 
     def rows(self, parts: Parts) -> Index:
         """Return the rows of some blocks, of each the first so many."""
@@ -216,9 +220,9 @@ class State:
         return True
 
     def settle(self) -> None:
-        """Notify front ends that something else than their frames changes the map."""
-        for front_end in self.front_ends.values():
-            front_end.settle()
+        """Notify sources that something else than their scans changes the map."""
+        for source in self.sources.values():
+            source.settle()
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""

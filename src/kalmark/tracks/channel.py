@@ -22,7 +22,7 @@ from kalmark.models import protocols
 from kalmark.models.known_view import known_view
 from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
 from kalmark.models.observe import is_built_in, landmark_at, linearize, sensor_pose, view_of
-from kalmark.models.protocols import Landmark, Sensor, finds_depth, has_second_camera, sees_kinds
+from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
 from kalmark.models.velocity_view import moving_view_of, velocity_of
 
@@ -138,7 +138,6 @@ class Channel:
         self.clone, self.since = -1, np.zeros(1 + held)
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
-        self.of_pair = has_second_camera(sensor)
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
         self.models = self._models(others)
         self.kinds = frozenset(self.models)

@@ -21,19 +21,13 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.events import Id, Scan
 from kalmark.geometry.rotations import conjugate, exp, from_matrix, left_jacobian, log, matrix, multiply, skew
+from kalmark.slam.sources import Replay
 
 FIRST, LATER, LAST = 8, 1.4, 250  # frames: the first attempt, how much later the next one is, the last one
 FRAMES, FEWEST = 8, 12  # that are fitted, spread over all; landmarks that must be left
 PARALLAX_RAD = 0.035  # 2 deg, of half of the landmarks
 SURE = 25.0  # by so many times the variance of a residual the reversed solution must fit worse
 LEAST_RHO = 0.02  # of the median inverse distance: what is found to be farther begins there
-
-
-class Begun(NamedTuple):
-    """The scans so far, each with the landmarks given up before it, and inverse distances of the first, 1/m."""
-
-    scans: list[tuple[Scan, list[Id]]]
-    rho: dict[Id, float]
 
 
 class Fit(NamedTuple):
@@ -62,7 +56,7 @@ class Beginning:
         self.poses.append(T.copy())
         self.matched.append(fitted)
 
-    def tried(self, cv2: Any, sensor: Any, prior: float) -> Begun | None:
+    def tried(self, cv2: Any, sensor: Any, prior: float) -> Replay | None:
         """Return the start of the map, once determined; the median of its inverse distances is the `prior`, 1/m."""
         k = len(self.scans) - 1
         if self.over or k < self.next:
@@ -81,7 +75,7 @@ class Beginning:
         if fit is None:
             return None
         rho = np.maximum(fit.rho / np.median(fit.rho), LEAST_RHO) * prior
-        begun = Begun(self.scans, dict(zip(left, rho.tolist(), strict=True)))
+        begun = Replay(self.scans, dict(zip(left, rho.tolist(), strict=True)))
         self.end()
         return begun
 

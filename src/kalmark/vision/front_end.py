@@ -11,25 +11,24 @@ from __future__ import annotations
 from collections.abc import Set
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.declare import Count, Positive, Within, register
-from kalmark.errors import MapError
-from kalmark.events import Frame, Id, Scan
-from kalmark.filter.map import Map
+from kalmark.errors import EventError, MapError
+from kalmark.events import Frame, Id, Raw, Scan, label_of_event
 from kalmark.geometry.rotations import matrix
+from kalmark.models.protocols import UnknownDepth, finds_depth, has_second_camera
 from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
-from kalmark.tracks.channel import Channel
-from kalmark.tracks.joint_expectation import PIXEL, Prospect, places_of
-from kalmark.tracks.track import Tracks
+from kalmark.slam.sources import FilterView, Found, Replay
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predict_templates, take_view
-from kalmark.vision.beginning import Beginning, Begun
+from kalmark.vision.beginning import Beginning
 from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
+from kalmark.vision.joint_expectation import PIXEL, Prospect, places_of
 from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane, plane_from_depths, plane_from_match
@@ -68,8 +67,8 @@ class ActiveSearch:
     ] = 4.0
     seed: Annotated[int, Within(ge=0), "Of what is chosen at random."] = 0
 
-    def front_end(self, sensor: Any) -> FrontEnd:
-        """Return the search of the frames of one sensor."""
+    def source(self, sensor: Any) -> FrontEnd:
+        """Return the source of the scans of one sensor."""
         return FrontEnd(self, sensor)
 
 
@@ -82,20 +81,10 @@ class Look(Searches):
     surveyed: bool = False  # known beforehand: it has no view until it is first seen, and is not given up
 
 
-class Sighting(NamedTuple):
-    """Result of a frame: a scan, and the removed landmarks, each with the reason.
-
-    `drifted` are landmarks that have drifted with the sensor, and the factor by which their covariance is too small.
-    """
-
-    scan: Scan
-    removed: list[tuple[Id, str]]
-    drifted: tuple[list[Id], float] | None = None
-
-
 class FrontEnd:
     """Searches the frames of one sensor; `looks` has how each landmark looked, `times` what the parts took, s."""
 
+    takes: ClassVar[type[Raw]] = Frame
     waits: ClassVar[bool] = False
     random: np.random.Generator
     cells: Cells
@@ -111,33 +100,45 @@ class FrontEnd:
         width = sensor.image[0]
         across = max(4, round(np.sqrt(1.6 * settings.in_view * width / sensor.image[1])))
         self.cells = Cells(self.cv2, across, TEMPLATE, settings.contrast)
-        self.looks, self.frame, self.named, self.beginning, self.is_lost = {}, 0, 0, None, False
-        self.found: Selection | None = None
+        self.looks, self.frame, self.named, self.is_lost = {}, 0, 0, False
+        self.beginning = Beginning() if isinstance(sensor, PinHole) else None
+        self.selection: Selection | None = None
         self.prospect: Prospect | None = None
         self.image: Any = None
-        self.sighting: Sighting | None = None
+        self.sighting: Found | None = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "update"), 0.0)
 
-    def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Prospect:
-        """Return the joint expectation of the landmarks in view."""
-        return Prospect(map_, tracks, channel, robot)
+    @property
+    def begins(self) -> bool:
+        """True if it keeps the first frames: together they may determine the first landmarks' distances."""
+        return self.beginning is not None
 
-    def recognised(self, image: Any, map_: Map, tracks: Tracks, channel: Channel) -> tuple[Array, Array] | None:
+    def read(self, raw: Frame) -> tuple[Any, Any]:
+        """Return the image (H, W) of a frame, and the right one of a pair or the depth in m, 0: none; None without.
+
+        Raises EventError.
+        """
+        image, pair = raw.grey(), has_second_camera(self.sensor)
+        beside = raw.right_grey() if pair else raw.depths() if finds_depth(self.sensor) else None
+        if beside is not None and beside.shape != image.shape:
+            what = "right image is" if pair else "depths are"
+            raise EventError(f"{label_of_event(raw)}: the {what} {beside.shape}, expected {image.shape} as the image")
+        return image, beside
+
+    def located(self, data: tuple[Any, Any], view: FilterView) -> tuple[Array, Array] | None:
         """Return the pose (7,) of a lost sensor that has recognised the place, and its covariance (6, 6)."""
         known = [name for name, look in self.looks.items() if look.fitted >= TRIAL and look.views]
         if not self.is_lost or len(known) < ENOUGH:
             return None
-        places = places_of(map_, tracks, channel, known)
+        places = places_of(view.map, view.tracks, view.channel, known)
         here = np.flatnonzero(np.isfinite(places).all(axis=1))
         views = [self.looks[known[k]].views for k in here.tolist()]
-        found = recognize_place(self.cv2, image, views, places[here], channel.calibrated(map_))
+        found = recognize_place(self.cv2, data[0], views, places[here], view.channel.calibrated(view.map))
         return None if found is None else (found.T, found.cov)
 
-    def search(self, frame: Frame, image: Any, prospect: Prospect, beside: Any = None) -> Sighting:
-        """Search an image (H, W) for the landmarks of a prospect, and for new ones.
-
-        `beside` (H, W) is the depth in m, 0: none, or the right image of a pair.
-        """
+    def found(self, raw: Raw, data: tuple[Any, Any], view: FilterView) -> Found:
+        """Search an image for the landmarks in view, and for new ones."""
+        prospect, (image, beside) = Prospect(view.map, view.tracks, view.channel, view.robot), data
         t0 = perf_counter()
         settings, cv2 = self.settings, self.cv2
         self.frame += 1
@@ -151,7 +152,7 @@ class FrontEnd:
         t1 = perf_counter()
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
         search, drifted = Search(prospect, looks.told, searcher, settings.updates), None
-        found = self.found = search.run(self.random)
+        found = self.selection = search.run(self.random)
         again = self._matched_again(image, prospect, searcher)
         if again is not None and search.run_again(*again).wider > 1.0:
             drifted = [name for name in prospect.names if self._seen_lately(name)], found.wider
@@ -163,7 +164,7 @@ class FrontEnd:
         y = found.y[rows]
         ids: list[Id] = [prospect.names[k] for k in rows]
         new = self._new(image, found, prospect, len(rows))
-        ids += [self._name(frame) for _ in new]
+        ids += [self._name(raw) for _ in new]
         removed += self._room(len(new), {name for name, _ in removed}, prospect)
         y, cov = np.concatenate([y, new]), None
         if isinstance(self.sensor, PixelDepth | Stereo):
@@ -174,14 +175,14 @@ class FrontEnd:
         t3 = perf_counter()
         for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", t3 - t2)):
             self.times[part] += spent
-        scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None,
+        scan = Scan(t_ns=raw.t_ns, robot=raw.robot, sensor=raw.sensor, y=y if len(y) else (), ids=ids or None,
                     cov=cov if len(y) else None)  # fmt: skip
-        self.sighting = Sighting(scan, removed, drifted)
+        self.sighting = Found(scan, removed, drifted)
         return self.sighting
 
-    def update(self, report: Report, T: Array) -> None:
-        """Update patches and counts of landmarks by the report of a frame; T (7,) is its sensor's pose now."""
-        t0 = perf_counter()
+    def update(self, report: Report, view: FilterView) -> Replay | None:
+        """Update patches and counts of landmarks by the report of a frame; return what is to be filtered again."""
+        T, t0 = view.T, perf_counter()
         assert self.prospect is not None
         at = {name: k for k, name in enumerate(self.prospect.names)}
         for o in report.observations:
@@ -190,10 +191,10 @@ class FrontEnd:
                 continue
             y = report.y[o.index, :PIXEL]
             if o.outcome == "new" and name not in self.looks:  # else it was only started again
-                view = self._taken(y, T)
-                if view is not None:
-                    look = self.looks[name] = Look(views=[view], seen=self.frame)
-                    look.plane = self._plane(y, view)
+                shot = self._taken(y, T)
+                if shot is not None:
+                    look = self.looks[name] = Look(views=[shot], seen=self.frame)
+                    look.plane = self._plane(y, shot)
                 continue
             look, k = self.looks[name], at[name]
             look.fits((o.d2 or 0.0) / report.y.shape[1], self.frame)
@@ -204,10 +205,10 @@ class FrontEnd:
                 )
             other = cosine < ANOTHER_COSINE or not 1 / ANOTHER_SCALE < scale < ANOTHER_SCALE
             if other and len(look.views) < MOST_VIEWS:
-                view = self._taken(y, T)
-                if view is not None:
-                    look.views.append(view)
-                    look.plane = look.plane or self._plane(y, view)
+                shot = self._taken(y, T)
+                if shot is not None:
+                    look.views.append(shot)
+                    look.plane = look.plane or self._plane(y, shot)
         for name, _ in report.removed:
             self.looks.pop(name, None)
         if self.beginning is not None:
@@ -216,18 +217,14 @@ class FrontEnd:
                       if o.landmark is not None and o.outcome in ("new", "associated")}  # fmt: skip
             self.beginning.add(self.sighting.scan, [name for name, _ in self.sighting.removed], fitted, T)
         self.times["update"] += perf_counter() - t0
+        return self._begun(view.channel.landmark)
 
     # ------------------------------------------------------------------ the beginning
-    def watch_beginning(self) -> None:
-        """Keep the first frames until they determine the first landmarks' distances: nothing else moves the map."""
-        if isinstance(self.sensor, PinHole):
-            self.beginning = Beginning()
-
-    def frames_to_filter_again(self, prior: float) -> Begun | None:
-        """Return, once, the start of the map, if the first frames determine it; the median of rho is `prior`, 1/m."""
-        if self.beginning is None:
+    def _begun(self, landmark: Any) -> Replay | None:
+        """Return, once, the start of the map, if the first frames determine it; the median of rho is the prior."""
+        if self.beginning is None or not isinstance(landmark, UnknownDepth) or landmark.prior_rho_per_m <= 0.0:
             return None
-        found = self.beginning.tried(self.cv2, self.sensor, prior)
+        found = self.beginning.tried(self.cv2, self.sensor, landmark.prior_rho_per_m)
         if self.beginning.over:
             self.beginning = None
         return found
@@ -274,17 +271,17 @@ class FrontEnd:
         look = self.looks.get(name)
         return look is not None and not look.surveyed and self.frame - look.seen <= AWAY
 
-    def _name(self, frame: Frame) -> Id:
+    def _name(self, raw: Raw) -> Id:
         """Return the id of a new landmark, which no other sensor gives."""
         self.named += 1
-        return f"{frame.robot}.{frame.sensor} {self.named}"
+        return f"{raw.robot}.{raw.sensor} {self.named}"
 
     def _matched_again(self, image: Any, prospect: Prospect, searcher: Searcher) -> tuple[Index, Array] | None:
         """Return landmarks (n,) and where they are recognised (n, 2), if those that come into view again are not found.
 
         Asked now and then, as it takes long: the sensor has drifted, or they are hidden.
         """
-        found = self.found
+        found = self.selection
         if self.frame % EVERY or found is None:
             return None
         looks = [(k, self.looks[prospect.names[k]]) for k in self.likely.told.tolist()]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from kalmark.report import Report
-from kalmark.tracks.joint_expectation import PIXEL
 from kalmark.vision.front_end import FrontEnd
+from kalmark.vision.joint_expectation import PIXEL
 from kalmark.vision.segments import LineFrontEnd
 from kalmark.vision.selection import GATE, Selection
 
@@ -35,14 +35,14 @@ def overlay(front_end: FrontEnd | LineFrontEnd, report: Report, scale: int = 1) 
         return u, v
 
     if isinstance(front_end, LineFrontEnd):
-        expected, found = front_end.expected, front_end.found
+        expected, found = front_end.expected, front_end.matches
         ends = zip(expected.e, found.of, strict=True) if expected is not None and found is not None else ()
         drawn = [(e, FOUND if number >= 0 else MISSED) for e, number in ends]
         drawn += [(report.y[o.index], COLOURS.get(o.outcome, REJECTED)) for o in report.observations]
         for segment, colour in drawn:
             cv2.line(picture, place(segment[:2]), place(segment[2:]), colour, scale, cv2.LINE_AA, 4)
         return picture
-    _ellipses(cv2, picture, front_end.found, place, scale)
+    _ellipses(cv2, picture, front_end.selection, place, scale)
     for o in report.observations:
         radius, filled = (4 * scale * FINE, 1) if o.outcome == "new" else (2 * scale * FINE, -1)
         colour = COLOURS.get(o.outcome, REJECTED)

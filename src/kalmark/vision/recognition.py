@@ -16,8 +16,8 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.geometry.frames3d import to_frame_many
 from kalmark.geometry.rotations import from_matrix
-from kalmark.tracks.joint_expectation import PIXEL, Prospect
 from kalmark.vision.appearance import View
+from kalmark.vision.joint_expectation import PIXEL, Prospect
 from kalmark.vision.template_matching import Searcher
 
 SIZES = (1.0, 0.7, 0.5)  # of the image, in which corners are described

@@ -17,14 +17,12 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.declare import Count, Positive, Within, register
-from kalmark.events import Frame, Id, Scan
-from kalmark.filter.map import Map
+from kalmark.events import Frame, Id, Raw, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.models.sensors import Segments
 from kalmark.report import Expectations, Report
-from kalmark.tracks.channel import Channel
+from kalmark.slam.sources import FilterView, Found
 from kalmark.tracks.expecting import expectations
-from kalmark.tracks.track import Tracks
 from kalmark.vision.opencv import opencv
 from kalmark.vision.searches import TRIAL, Searches
 
@@ -54,8 +52,8 @@ class LineSearch:
     most: Annotated[Count, "At most so many lines in the map: the least useful out of view make room."] = 100
     accept: Annotated[float, Within(gt=0, lt=1), "Correlation of the profiles of a match, at least."] = 0.8
 
-    def front_end(self, sensor: Any) -> LineFrontEnd:
-        """Return the search of the frames of one sensor."""
+    def source(self, sensor: Any) -> LineFrontEnd:
+        """Return the source of the scans of one sensor."""
         return LineFrontEnd(self, sensor)
 
 
@@ -80,7 +78,9 @@ class Matches(NamedTuple):
 class LineFrontEnd:
     """Searches the frames of one sensor for lines; `looks` has how each looked, `times` what the parts took, s."""
 
+    takes: ClassVar[type[Raw]] = Frame
     waits: ClassVar[bool] = True
+    begins: ClassVar[bool] = False
     looks: dict[Id, LineLook]
     frame: int
     named: int
@@ -91,24 +91,23 @@ class LineFrontEnd:
         self.detector = self.cv2.createLineSegmentDetector(
             self.cv2.LSD_REFINE_STD, HALVED if width >= WIDE_PX else FULL
         )
-        self.beginning: None = None
         self.looks, self.frame, self.named = {}, 0, 0
         self.expected: Expectations | None = None
-        self.found: Matches | None = None
+        self.matches: Matches | None = None
         self._numbers: list[int] = []  # of the segments of the last scan
         self.image: Any = None
         self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "update"), 0.0)
 
-    def recognised(self, image: Any, map_: Map, tracks: Tracks, channel: Channel) -> None:
+    def read(self, raw: Frame) -> Any:
+        """Return the image (H, W) of a frame.  Raises EventError."""
+        return raw.grey()
+
+    def located(self, data: Any, view: FilterView) -> None:
         """Return that lines recognise no place."""
 
-    def prospect_of(self, map_: Map, tracks: Tracks, channel: Channel, robot: str) -> Expectations:
-        """Return the joint expectation of the lines in view."""
-        return expectations(map_, tracks, channel, robot, "", only_in_view=True)
-
-    def search(self, frame: Frame, image: Any, expected: Expectations, beside: Any = None
-    ) -> tuple[Scan, list[tuple[Id, str]], None]:  # fmt: skip
+    def found(self, raw: Raw, data: Any, view: FilterView) -> Found:
         """Search an image (H, W) for the lines expected, and for new ones."""
+        image, expected = data, expectations(view.map, view.tracks, view.channel, view.robot, "", only_in_view=True)
         t0 = perf_counter()
         self.frame, self.image, self.expected = self.frame + 1, image, expected
         segments = self._detected(image)
@@ -120,7 +119,7 @@ class LineFrontEnd:
         may, length = compatible_segments(expected.e, expected.Z, segments, self.sensor.sigma_px)
         alike = mine @ across.T
         of = assign_pairs(np.where(may & (alike >= self.settings.accept), alike * length, 0.0))
-        self.found = Matches(segments, across, of)
+        self.matches = Matches(segments, across, of)
         removed = []
         for name, look, number in zip(expected.names, known, of.tolist(), strict=True):
             if look is not None and (reason := look.searched_for(number >= 0)):
@@ -134,23 +133,23 @@ class LineFrontEnd:
         ids: list[Id] = [expected.names[k] for k in rows.tolist()]
         for _ in new:
             self.named += 1
-            ids.append(f"{frame.robot}.{frame.sensor} {self.named}")
+            ids.append(f"{raw.robot}.{raw.sensor} {self.named}")
         y = segments[np.concatenate([of[rows], new]).astype(np.int64)]
         for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", perf_counter() - t2)):
             self.times[part] += spent
-        scan = Scan(t_ns=frame.t_ns, robot=frame.robot, sensor=frame.sensor, y=y if len(y) else (), ids=ids or None)
+        scan = Scan(t_ns=raw.t_ns, robot=raw.robot, sensor=raw.sensor, y=y if len(y) else (), ids=ids or None)
         self._numbers = [*of[rows].tolist(), *new]
-        return scan, removed, None
+        return Found(scan, removed)
 
-    def update(self, report: Report, T: Array) -> None:
+    def update(self, report: Report, view: FilterView) -> None:
         """Update profiles and counts of lines by the report of a frame."""
         t0 = perf_counter()
-        assert self.found is not None
+        assert self.matches is not None
         for o in report.observations:
             if o.landmark is None or o.outcome not in ("new", "associated"):
                 continue
             look = self.looks.setdefault(o.landmark, LineLook())
-            look.profile = self.found.profiles[self._numbers[o.index]]
+            look.profile = self.matches.profiles[self._numbers[o.index]]
             if o.outcome == "associated":
                 look.fitted, look.missed = look.fitted + 1, 0
             look.seen = self.frame
@@ -169,8 +168,8 @@ class LineFrontEnd:
 
     def _new(self, expected: Expectations, count: int) -> list[int]:
         """Return the numbers of the segments that begin lines: long ones where none is expected."""
-        assert self.found is not None
-        segments, of = self.found.segments, self.found.of
+        assert self.matches is not None
+        segments, of = self.matches.segments, self.matches.of
         wanted = min(self.settings.in_view - count, self.settings.starts)
         length = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1])
         taken, new = np.concatenate([expected.e, segments[of[of >= 0]]]), list[int]()
@@ -191,18 +190,12 @@ class LineFrontEnd:
         )
         return [(name, "made room") for *_, name in out[: max(over, 0)]]
 
-    # ------------------------------------------------------------------ what a front end is asked besides
-    def watch_beginning(self) -> None:
-        """Lines begin when the map has begun: nothing is kept."""
-
+    # ------------------------------------------------------------------ what a source is asked besides
     def settle(self) -> None:
         """Nothing is kept of the first frames."""
 
     def survey(self, name: Id) -> None:
         """Search for a line known beforehand: its profile is not known, so that it is not found."""
-
-    def frames_to_filter_again(self, prior: float) -> None:
-        """Return that no frame is to be filtered again."""
 
     def replace_poses(self, poses: list[Array], names: Set[Id]) -> None:
         """Take over that only `names` are left."""

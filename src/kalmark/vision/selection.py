@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.tracks.joint_expectation import PIXEL, Belief, Prospect
+from kalmark.vision.joint_expectation import PIXEL, Belief, Prospect
 from kalmark.vision.template_matching import Searcher
 
 GATE = 9.0  # of d2: three sigmas of each axis of an ellipse

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.tracks.joint_expectation import Belief, Prospect
 from kalmark.vision.features import responses
+from kalmark.vision.joint_expectation import Belief, Prospect
 from kalmark.vision.selection import GATE
 
 AT_ONCE = 12  # landmarks that are looked for in a frame

@@ -17,8 +17,8 @@ from kalmark.geometry.frames3d import from_euler_pose, from_frame_many, to_frame
 from kalmark.logs import write_native
 from kalmark.models import cameras
 from kalmark.simulate import load_world, simulate
-from kalmark.simulate.layouts import TexturedPlanes, TexturedRoom
-from kalmark.simulate.rendering import SKY, Rectangle, Renderer, texture
+from kalmark.vision.rendering import SKY, Rectangle, Renderer, texture
+from kalmark.vision.textured_layouts import TexturedPlanes, TexturedRoom
 
 SIZE = {"width_px": 320, "height_px": 240}
 K = {"fx_px": 250.0, "fy_px": 255.0, "cx_px": 158.0, "cy_px": 121.0}
@@ -63,14 +63,14 @@ def test_a_corner_on_a_plane_lies_where_the_camera_model_has_it(name: str) -> No
 
 def test_depth_is_that_of_the_nearest_plane_and_exact_at_any_pixel() -> None:
     camera, rng = CAMERAS["radtan"], np.random.default_rng(3)
-    scenery = TexturedRoom(panels=5, pixel_m=0.02).scenery(rng)
+    planes = TexturedRoom(panels=5, pixel_m=0.02).textured(rng)
     T = pose(3.0, 2.0, 1.4, -95, 3, -70)
-    image, depth = Renderer(scenery.planes, camera).taken(T, rng)
+    image, depth = Renderer(planes, camera).taken(T, rng)
     y = np.column_stack([rng.integers(0, n, 300) for n in (320, 240)])
     rays = cameras.back_project(camera.code, y.astype(np.float64), np.array(camera.parameters))[0]
     for (u, v), ray in zip(y, rays, strict=True):
         nearest = np.inf
-        for plane in scenery.planes:
+        for plane in planes:
             ends = to_frame_many(plane.pose, from_frame_many(T, np.array([np.zeros(3), ray]))[0])[0]
             t = ends[0, 2] / (ends[0, 2] - ends[1, 2])
             x = ends[0] + t * (ends[1] - ends[0])
@@ -84,7 +84,7 @@ def test_depth_is_that_of_the_nearest_plane_and_exact_at_any_pixel() -> None:
 
 def test_planes_of_a_world_have_their_middles_and_sizes_where_it_says() -> None:
     plane = {"x_m": 2.0, "y_m": 1.0, "z_m": 0.5, "roll_deg": -90.0, "yaw_deg": -90.0, "width_m": 1.5, "height_m": 0.5}
-    (found,) = TexturedPlanes(planes=(plane,), pixel_m=0.01).scenery(np.random.default_rng(0)).planes
+    (found,) = TexturedPlanes(planes=(plane,), pixel_m=0.01).textured(np.random.default_rng(0))
     assert found.corners().mean(axis=0) == pytest.approx([2.0, 1.0, 0.5])
     assert found.size_m == pytest.approx([1.5, 0.5])
     assert np.ptp(found.corners(), axis=0) == pytest.approx([0.0, 1.5, 0.5], abs=1e-12)
@@ -135,7 +135,7 @@ def test_a_simulated_camera_gives_images_of_its_true_poses_from_the_start_on(tmp
 
 def test_images_want_a_world_of_textures_and_a_camera() -> None:
     room = "world={type: random_box}"
-    with pytest.raises(ConfigError, match="expected images in a world of textures, textured_room or textured_planes"):
+    with pytest.raises(ConfigError, match="expected images in a world that has them: textured_planes or textured_room"):
         load_world("textured_room", [room])
     laser = "robots.robot.sensors.camera={type: range_bearing_3d, mount: {roll_deg: -90}}"
     kinds = "pinhole or pixel_depth or stereo or omnidirectional"

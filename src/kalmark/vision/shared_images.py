@@ -13,7 +13,7 @@ from kalmark.config.sections import model_of
 from kalmark.config.tree import Tree
 from kalmark.events import Event, Frame
 from kalmark.logs.log import Log
-from kalmark.plugins import load
+from kalmark.vision.straight import Straightened
 
 TAKEN = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px", "mount")
 TAKERS = "pinhole", "segments"  # types of sensors that can take them
@@ -31,7 +31,7 @@ def complete(tree: Tree) -> None:
                 sensors[name] = {key: camera[key] for key in TAKEN if key in camera} | sensor
 
 
-def with_images(config: Config, log: Log) -> Log:
+def with_events(config: Config, log: Log) -> Log:
     """Return a log in which each frame of a camera is one of the sensors, too, that take its images.
 
     Raises ConfigError.
@@ -85,6 +85,6 @@ def _cameras(config: Config, robot: str) -> dict[str, list[tuple[str, Any]]]:
         source, model = (model_of(sensors[of], "space") for of in (camera, name))
         numbers = [[getattr(of, key, None) for key in TAKEN[:-1]] for of in (source, model)]
         bent = numbers[0] != numbers[1] or bool(getattr(source, "distortion", None))
-        straight = load("names", "vision").Straightened(source, model.intrinsics, model.image) if bent else None
+        straight = Straightened(source, model.intrinsics, model.image) if bent else None
         found.setdefault(camera, []).append((name, straight))
     return found

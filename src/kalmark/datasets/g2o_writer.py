@@ -6,6 +6,7 @@ id of each.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,15 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.batch.motion_chain import Chain
 from kalmark.errors import RunError
-from kalmark.events import Control, Fix, Frame, Scan
+from kalmark.events import Control, Fix, Raw, Scan
+from kalmark.files import write
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.rotations import matrix
+from kalmark.logs.increments import cut_increments
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from kalmark.logs.log import Log
     from kalmark.results.run import Run
@@ -30,8 +34,21 @@ POLAR = (("range_m", "bearing_rad"), ("range_m", "azimuth_rad", "elevation_rad")
 POINTS = (("x_m", "y_m"), ("x_m", "y_m", "z_m"))
 
 
-def g2o_text(run: Run, log: Log, robots: Mapping[str, Robot]) -> str:
-    """Return the graph of a run.  Raises RunError for sensors that do not observe positions, KalmarkError."""
+def export(path: Path, log: Log | None, run: Run | None) -> dict[str, int]:
+    """Write the graph of a run, increments cut as the filter took them; return the number of lines by tag.
+
+    Raises RunError for sensors that do not observe positions, KalmarkError.
+    """
+    if log is None or run is None:
+        raise RunError(f"{path}: no run to write, expected the folder of one: a graph needs estimates and noise")
+    whole = (run.config.get("log") or {}).get("increments") == "recorded"
+    lines = [*graph(run, log if whole else cut_increments(log), run.final_slam().robots)]
+    write(path, "\n".join(lines) + "\n")
+    return dict(Counter(line.partition(" ")[0] for line in lines if not line.startswith("#")))
+
+
+def graph(run: Run, log: Log, robots: Mapping[str, Robot]) -> Iterator[str]:
+    """Yield the lines of the graph of a run.  Raises RunError, KalmarkError."""
     chain = Chain(robots, {}, {})
     for name, sensor in log.sensor_columns:
         columns = tuple(robots[name].sensors[sensor].sensor.columns) if name in robots else POINTS[0]
@@ -56,12 +73,13 @@ def g2o_text(run: Run, log: Log, robots: Mapping[str, Robot]) -> str:
         raise RunError("the run has no scan, expected some: the graph has a pose for each of them")
     known = dict(zip(map(str, run.landmarks.ids), run.landmarks.means, strict=True))
     number = {name: len(chain.nodes) + k for k, name in enumerate(name for name in known if len(known[name]) == d)}
-    lines = [*_vertices(chain, nodes, robots), *_landmarks(number, known, d), *_moves(chain)]
-    lines += [_sight(node, number[name], p, C) for node, name, p, C in sights if name in number]
-    return "\n".join(lines) + "\n"
+    yield from _vertices(chain, nodes, robots)
+    yield from _landmarks(number, known, d)
+    yield from _moves(chain)
+    yield from (_sight(node, number[name], p, C) for node, name, p, C in sights if name in number)
 
 
-def _observed(event: Scan | Frame, robot: Robot, history: Any, rows: list[int]) -> Iterator[tuple[str, Array, Array]]:
+def _observed(event: Scan | Raw, robot: Robot, history: Any, rows: list[int]) -> Iterator[tuple[str, Array, Array]]:
     """Yield landmark, position in the robot's frame (d,) and covariance of the observations that were fused."""
     mount = robot.sensors[event.sensor]
     at, m = np.array(mount.at), len(mount.sensor.columns)
