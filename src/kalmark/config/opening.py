@@ -17,7 +17,7 @@ from kalmark.logs.formats import recognise
 from kalmark.logs.log import Log
 from kalmark.plugins import load
 
-OF_PLUGINS = ("images",)  # keys of sensors of which a plug-in knows what they do
+OF_PLUGINS = ("images",)  # keys of sensors that a plug-in implements
 
 
 def open_run(
