@@ -70,4 +70,4 @@ $(VENV)-lowest/stamp: pyproject.toml
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-lowest out build docs/api docs/lessons docs/project
+	rm -rf $(VENV) $(VENV)-lowest out build docs/api docs/how docs/lessons docs/project

@@ -25,7 +25,7 @@ extensions = [
     "project_pages",
     "api_pages",
 ]
-exclude_patterns = ["course", "site", "**/*.ipynb"]
+exclude_patterns = ["course", "tutorials", "site", "**/*.ipynb"]
 root_doc = "index"
 language = "en"
 maximum_signature_line_length = 90
@@ -39,10 +39,10 @@ myst_dmath_double_inline = True
 mathjax_path = "mathjax/tex-chtml.js"
 mathjax3_config = {"options": {"enableMenu": False}}
 
-# A page of the course is a program: course/CHAPTER/plot_NAME.py
+# A page of the course or a tutorial is a program: course/CHAPTER/plot_NAME.py, tutorials/plot_NAME.py
 sphinx_gallery_conf = {
-    "examples_dirs": ["course"],
-    "gallery_dirs": ["lessons"],
+    "examples_dirs": ["course", "tutorials"],
+    "gallery_dirs": ["lessons", "how"],
     "filename_pattern": r"plot_",
     "within_subsection_order": "FileNameSortKey",
     "subsection_order": ["course/guide", "course/exercises", "course/slides", "course/toolbox"],

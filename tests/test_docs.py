@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import doctest
 import inspect
 import json
@@ -20,13 +21,15 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark import declare
 from kalmark.cli.app import app
 from kalmark.declare import built_in, is_own, registered_name, world_of_class
-from kalmark.logs import known_formats
+from kalmark.logs import FORMATS, known_formats
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 LESSONS = sorted((ROOT / "docs" / "course").rglob("plot_*.py"))
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("plot_*.py"))
 BLOCKS = [
     (page, number, block)
     for page in PAGES
@@ -57,9 +60,23 @@ def test_a_lesson_runs_and_is_short(lesson: Path, tmp_path: Path, monkeypatch: p
     text = lesson.read_text()
     code = [line for line in text.split('"""', 2)[2].splitlines() if line.strip() and not line.startswith("#")]
     assert len(code) <= 30 and max(map(len, code)) <= 96
-    monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(lesson))
+    run_in_this_process(lesson, tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda p: p.stem)
+def test_a_tutorial_runs(tutorial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_in_this_process(tutorial, tmp_path, monkeypatch)
+
+
+def run_in_this_process(program: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run a program of the site; forget the models and formats that it registers."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(declare, "_CLASSES", copy.deepcopy(declare._CLASSES))
+    formats = dict(FORMATS)
+    runpy.run_path(str(program))
     plt.close("all")
+    for name in FORMATS.keys() - formats.keys():
+        del FORMATS[name]
 
 
 EXAMPLES = {

@@ -1,4 +1,4 @@
-"""CONTRIBUTING.md and CHANGELOG.md as pages of the site, in project/, their links as seen from there."""
+"""CONTRIBUTING.md and CHANGELOG.md as pages of the site, in project/, and links to programs as they are shown."""
 
 import re
 from pathlib import Path
@@ -18,9 +18,11 @@ def write(app: Any) -> None:
 
 
 def link(app: Any, name: str, source: list[str]) -> None:
-    """Point the pages to these instead of the files above them."""
+    """Point the pages to these instead of the files above them, and to the page of a program."""
     for file, page in FILES.items():
         source[0] = source[0].replace(f"](../{file}", f"]({page}")
+    for programs, shown in (("tutorials", "how"), ("course", "lessons")):
+        source[0] = re.sub(rf"\]\({programs}/([\w/]+)\.py\)", rf"]({shown}/\1.rst)", source[0])
 
 
 def setup(app: Any) -> dict[str, bool]:

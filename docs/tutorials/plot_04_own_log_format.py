@@ -1,0 +1,57 @@
+"""
+Your own log format
+===================
+
+A format is a function that finds a log in a path and one that reads it as ``Control``, ``Scan``, ``Frame`` and
+``Fix``. Tables and data frames need none: ``km.log_from(controls=df, scans=df)`` takes them.
+"""
+
+# %%
+# A file of lines
+# ---------------
+#
+# This log has a line an event: a time and two speeds, or a time, a number, a range and a bearing.
+from pathlib import Path
+from tempfile import mkdtemp
+
+import kalmark as km
+from kalmark.logs import FORMATS
+from kalmark.logs.source import Format
+
+file = Path(mkdtemp()) / "day.walk"
+file.write_text("0.0,0.5,0.1\n0.5,7,4.2,0.3\n1.0,0.5,0.1\n1.5,7,3.8,0.2\n")
+
+
+# %%
+# The reader
+# ----------
+#
+# ``request`` has what the user asked for (times, robots, what is done about a bad row).
+def find(path):
+    return path if path.suffix == ".walk" else None
+
+
+def read(path, request):
+    events = []
+    for line in path.read_text().splitlines():
+        t, *values = map(float, line.split(","))
+        if len(values) == 2:
+            events.append(km.Control(t_s=t, robot="rover", u=values))
+        else:
+            y, ids = [values[1:]], [int(values[0])]
+            events.append(km.Scan(t_s=t, robot="rover", sensor="lidar", y=y, ids=ids))
+    return km.Log(path.stem, ("rover",), events, "walk", path)
+
+
+FORMATS["walk"] = Format("walk", "a file that ends in .walk", find, read)
+
+# %%
+# Open it
+# -------
+#
+# In a configuration, ``plugins: [my_formats.py]`` runs this file and ``log: {path: day.walk}`` finds the format by
+# itself. A package adds formats by an entry point instead (:doc:`/plugins`).
+log = km.open_log(file)
+print(log)
+rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+print(km.record(km.Slam(rover), log, progress=False))
