@@ -54,7 +54,7 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
     "plot_gallery": "True",
     "image_srcset": ["2x"],
-    "capture_repr": ("_repr_html_", "__repr__"),
+    "capture_repr": ("_repr_html_",),  # a page shows what it prints
     "copyfile_regex": r".*\.csv",
     "default_thumb_file": str(DOCS / "images" / "cloister.png"),
 }

@@ -72,8 +72,10 @@ def write(folder: Path) -> None:
 
 
 def public_names(module: str) -> dict[str, Any]:
-    """Return the names that a module lists, without modules."""
-    things = {name: getattr(import_module(module), name) for name in import_module(module).__all__}
+    """Return the names that a module lists, those of plug-ins included, without modules."""
+    home = import_module(module)
+    names = [name for name in dir(home) if not name.startswith("_")] if home is km else home.__all__
+    things = {name: getattr(home, name) for name in names}
     return {name: thing for name, thing in things.items() if not inspect.ismodule(thing)}
 
 

@@ -27,12 +27,13 @@ for sigma in (0.033, 0.1, 0.3):
     said = [f"{key}.sigma_range_m={sigma}", f"{key}.sigma_bearing_rad={sigma / 5}", "steps=300"]
     run = km.record(build_slam(load_world("random_field", said).config(), log), log, progress=False)
     told = run.evaluate()
-    nis = run.history.d2 / 2
+    nis = run.history.d2[np.isfinite(run.history.d2)] / 2
     ax.plot(np.convolve(nis, np.ones(200) / 200, "valid"), label=f"{sigma} m")
-    print(f"sigma {sigma:5} m: NIS {told['nis_per_dof']:.2f}, pose NEES {told['robots']['rover']['pose_nees']:.1f}")
+    nees = told["robots"]["rover"]["pose_nees"]
+    print(f"sigma {sigma:5} m: NIS {told['nis_per_dof']:.2f}, pose NEES {nees:.1f}")
 ax.axhline(1, color="0.5")
 ax.set(yscale="log", xlabel="observation", ylabel="NIS per degree of freedom")
-ax.legend(title="stated noise of the range")
+ax.legend(title="stated noise of the range", loc="center right")
 
 # %%
 # Which part is wrong
