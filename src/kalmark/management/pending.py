@@ -2,7 +2,8 @@
 
 All methods are one idea: measurements made from cloned poses, pending until a test passes.  They differ in the solver:
 where bearings intersect (`delayed`), where ranges meet (`trilateration`), which of several directions a range has
-(`hypotheses`), which of two poses a tag has (`tags`).  A method reads and returns steps; `Slam` applies them.
+(`hypotheses`), which of two poses a tag has (`ambiguous_tags`).  A method reads and returns steps, which
+`slam.starting` applies.
 """
 
 from __future__ import annotations

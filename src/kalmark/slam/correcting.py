@@ -107,8 +107,9 @@ def _approach(
     state: State, scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int], known: Array | None,
     some: Sequence[int], least: float,
 ) -> bool:  # fmt: skip
-    """Correct by those of `some` observations that are far from what is expected, if any are: `tags`, `depths`.
+    """Correct by those of `some` observations that are far from what is expected; return whether any are.
 
+    They are tags, or have a depth that was measured: `ambiguous_tags`, `measured_depths`.
     `slots` (K,) and `rows` are of all of them, as are the numbers (K, n) of landmarks `known` exactly; `some` are the
     numbers of those that are meant, `least` is the gate.
     """

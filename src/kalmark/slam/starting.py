@@ -41,7 +41,7 @@ def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name:
     if refusal is not None:
         return refusal
     if policy.deferred is not None and not isinstance(name, Answer):
-        return _defer(state, scan, policy.deferred, k, name)
+        return _defer_initialization(state, scan, policy.deferred, k, name)
     start, space = scan.start_of(k), channel.landmark.space
     if start.mean.shape != (space.size,):
         found = f"it finds {len(start.mean)} numbers, a {channel.landmark.kind} has {space.size}"
@@ -124,7 +124,7 @@ def _refusal(state: State, scan: ScanContext, policy: Policy, k: int, name: Any,
     )
 
 
-def _defer(state: State, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:
+def _defer_initialization(state: State, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:
     """Take a measurement that alone does not determine a landmark; start the landmark if all of them do."""
     track = state.tracks.pending.get(name)
     track = track or Track(name, scan.channel.landmark, status=Status.PENDING, pending=Pending(scan.key, name))
@@ -132,17 +132,17 @@ def _defer(state: State, scan: ScanContext, way: Initialization, k: int, name: I
         step = way.observe(scan, k, track.pending or Pending(scan.key, name))
         if step.start is not None and not step.start.is_finite:
             step = Step("ignored", UNEXPLAINED)
-        _take(state, scan, k, track, step)
+        _apply_step(state, scan, k, track, step)
         if not step.reason and step.start is None:
             assert track.pending is not None
             step = way.solve(scan, track.pending)
-            _take(state, scan, k, track, step)
+            _apply_step(state, scan, k, track, step)
     except MapError as full:
         return Observation(k, scan.ids[k], "ignored", None, None, str(full))
     return Observation(k, scan.ids[k], step.outcome, name if step.start else None, None, step.reason)
 
 
-def _take(state: State, scan: ScanContext, k: int, track: Track, step: Step) -> None:
+def _apply_step(state: State, scan: ScanContext, k: int, track: Track, step: Step) -> None:
     """Apply a step of an initialiser.  Raises MapError where the map is full."""
     pending = step.pending or track.pending
     assert pending is not None
