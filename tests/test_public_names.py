@@ -13,7 +13,7 @@ from kalmark.logs.log import Log
 
 MODULES = (
     "association", "detect", "estimators", "geometry", "initialization", "landmarks", "motion", "presets", "sensors",
-    "vision",
+    "textbook", "vision",
 )  # fmt: skip
 OF_PLUGINS = ("Verdict", "diagnose", "vision")
 PACKAGES = (

@@ -30,7 +30,7 @@ PARTS = [
     ("Rotations", "km.geometry.rotations", "kalmark.geometry.rotations"),
     ("Poses in space", "km.geometry.frames3d", "kalmark.geometry.frames3d"),
     ("Directions", "km.geometry.directions", "kalmark.geometry.directions"),
-    ("The textbook filter", "kalmark.filter.textbook", "kalmark.filter.textbook"),
+    ("Textbook filters", "km.textbook", "kalmark.filter.textbook"),
     ("Events", "kalmark.events", "kalmark.events"),
     ("Reports", "kalmark.report", "kalmark.report"),
     ("History of a run", "kalmark.results.history", "kalmark.results.history"),

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from kalmark import association, detect, geometry
     from kalmark.declare import register
     from kalmark.events import Control, Fix, Frame, Scan
-    from kalmark.filter import estimators
+    from kalmark.filter import estimators, textbook
     from kalmark.logs import Log, log_from, open_log, stream_log
     from kalmark.management import initialization
     from kalmark.management.attention import Attention
@@ -40,7 +40,7 @@ __all__ = [
     "Attention", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount", "Observation",
     "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry",
     "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record", "register",
-    "sensors", "stream_log",
+    "sensors", "stream_log", "textbook",
 ]  # fmt: skip
 
 _MODULES = {
@@ -53,6 +53,7 @@ _MODULES = {
     "motion": "kalmark.models.motion",
     "presets": "kalmark.presets",
     "sensors": "kalmark.models.sensors",
+    "textbook": "kalmark.filter.textbook",
 }
 _NAMES = {
     "kalmark.declare": ("register",),
