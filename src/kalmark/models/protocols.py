@@ -33,6 +33,8 @@ class _OnceAClass(type(Protocol)):  # type: ignore[misc]
     """Type of protocols that `isinstance` compares once with each class; an instance at a time costs 20 us and more."""
 
     def __instancecheck__(cls, model: object) -> bool:
+        if isinstance(model, type):  # a class is compared by its own attributes
+            return bool(super().__instancecheck__(model))
         key = cls, type(model)
         if key not in _FOUND:
             _FOUND[key] = super().__instancecheck__(model)
