@@ -133,7 +133,7 @@ def slam_of(log: Log, held: bool = False, gaps: str = "widen", **of_slam: Any) -
 def mapped(log: Log, held: bool = False, gaps: str = "widen", repeats: str = "off", **of_slam: Any) -> Run:
     """Return the run of a log through the filter."""
     slam = slam_of(log, held, gaps, upkeep=km.Upkeep(repeats=repeats), **of_slam)
-    return record(slam, log, progress=False, pictures=False)
+    return record(slam, log, progress=False)
 
 
 def right(run: Run, log: Log) -> bool:

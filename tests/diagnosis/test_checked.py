@@ -32,7 +32,7 @@ def simulated(world: str, settings: tuple[str, ...], change: Change | None = Non
 
     def run_of(log: Log) -> Run:
         config = made.config()
-        return km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
+        return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
 
     return log, run_of
 

@@ -60,7 +60,7 @@ def run_of(change: Change | None = None, settings: tuple[str, ...] = (), seed: i
     log, config = log_of(seed), world_of(*settings).config()
     if change is not None:
         log = replace(log, events=sorted(map(change, log.events), key=lambda e: e.t_ns))
-    return km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
 
 
 @cache
@@ -190,9 +190,7 @@ def test_a_robot_that_was_carried_away_is_noticed_at_that_time() -> None:
             events.append(Control(t_ns=t_ns, robot=e.robot, u=e.u))
     log = replace(log, events=events, truth={})
     config = world_of().config()
-    verdict = km.diagnose(
-        km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
-    )
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
     assert verdict.causes[0].name == "kidnapped"
     assert (verdict.sigma_factor or 0.0) > 2
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=5.0)
@@ -220,7 +218,7 @@ def bumped(seed: int, by: tuple[float, float, float], when: float = 0.5) -> tupl
 
 def recorded(log: Log, *settings: str) -> Run:
     config = world_of(*settings).config()
-    return km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
 
 
 @pytest.mark.parametrize("seed", [1, 3])
@@ -294,7 +292,7 @@ def test_controls_that_jump_among_surveyed_tags_are_named_without_a_batch_soluti
         y = km.landmarks.Tag().seen_from(at, np.array(tags))[0][: 4 + k % 8]
         y = np.array([SE3.plus(one, 0.02 * rng.normal(size=6)) for one in y])
         events.append(Scan(t_s=0.2 * k, robot="cam", sensor="eye", y=y, ids=range(len(y))))
-    verdict = km.diagnose(km.record(slam, Log("tags", ("cam",), events), progress=False, pictures=False))
+    verdict = km.diagnose(km.record(slam, Log("tags", ("cam",), events), progress=False))
     assert verdict.map == "doubtful" and "no batch solution" in verdict.checked
     first = verdict.causes[0]
     assert first.name == "odometry_jump" and first.since_s == pytest.approx(16.0)
@@ -397,7 +395,7 @@ def by_fixes(world: str, *settings: str) -> Callable[[str], Run]:
 
     def run_from(start: str) -> Run:
         config = load_world(world, [*settings, start]).config()
-        return km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
+        return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
 
     return run_from
 
@@ -553,7 +551,7 @@ def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidn
         return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=[{a: b, b: a}.get(i, i) for i in e.ids])
 
     log = replace(log, events=[*map(swapped, log.events)])
-    run = km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
+    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
     verdict = km.diagnose(run)
     assert (verdict.map, verdict.causes[0].name) == ("wrong", "wrong_ids")
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=2.0)
@@ -577,9 +575,7 @@ def test_wrong_ids_that_pull_the_solution_far_are_named_alone_and_the_map_is_not
 
     log = simulate(made, 3)
     log = replace(log, events=[*map(mixed, log.events)])
-    run = km.record(
-        build_slam(made.config(), log), log, progress=False, pictures=False, config=config_dict(made.config())
-    )
+    run = km.record(build_slam(made.config(), log), log, progress=False, config=config_dict(made.config()))
     places = np.array([log.landmarks[name][:2] for name in run.landmarks.ids])
     mapped = run.landmarks.positions()[0]
     off = rmse(rigid(mapped, places)(mapped) - places)
@@ -612,7 +608,7 @@ def test_a_landmark_that_moves_by_less_than_the_map_is_good_to_is_no_cause() -> 
 def test_what_is_left_of_data_is_their_projection_in_textbook_form() -> None:
     run = run_of(settings=("steps=12",))
     log = Log("", ("rover",), simulate(world_of("steps=12"), 3).events)
-    run = km.record(build_slam(world_of().config(), log), log, progress=False, pictures=False)
+    run = km.record(build_slam(world_of().config(), log), log, progress=False)
     problem = replay_events(batch_input(run), log)
     linear = Linear.of(problem, optimum(problem).state)
     rng, n, q = np.random.default_rng(1), len(linear.at.z), len(linear.at.w)
@@ -632,7 +628,7 @@ def test_what_is_left_of_data_is_their_projection_in_textbook_form() -> None:
 def test_systematic_errors_of_controls_match_differences() -> None:
     log = simulate(world_of("steps=12"), 3)
     config = world_of().config()
-    run = km.record(build_slam(config, log), log, progress=False, pictures=False)
+    run = km.record(build_slam(config, log), log, progress=False)
     given = batch_input(run)
     problem, h = replay_events(given, log), 1e-6
     for k, error in enumerate(problem.motions.errors):
@@ -678,9 +674,7 @@ def test_the_table_of_innovations_accuses_the_range_that_is_wrong() -> None:
 def test_a_filter_that_reads_its_position_is_not_too_sure_against_a_batch_solution_that_does_not() -> None:
     world = load_world("lever_arm", ["steps=300"])
     log, config = simulate(world, 3), world.config()
-    verdict = km.diagnose(
-        km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
-    )
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
     assert not verdict.causes
     assert verdict.sigma_factor is not None and 0.5 < verdict.sigma_factor < 2.0
 
@@ -689,7 +683,7 @@ def test_the_textbook_filter_is_named_as_what_is_too_sure() -> None:
     for estimator, named, factor in (("ekf", ["estimator"], 2.0), ("invariant", [], 0.9)):
         world = load_world("loop_b2", [f"filter.estimator.type={estimator}"])
         log, config = simulate(world, 3), world.config()
-        run = km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
+        run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
         verdict = km.diagnose(run)
         assert [cause.name for cause in verdict.causes] == named
         assert factor < (verdict.sigma_factor or 0.0) < 3 * factor
@@ -718,7 +712,7 @@ def test_a_run_that_used_no_observation_is_not_ok() -> None:
     )
     radio = km.Mount(km.sensors.SignalStrength2D())
     slam = km.Slam(km.Robot("r", motion=km.motion.Unicycle(), sensors={"radio": radio}))
-    verdict = km.diagnose(km.record(slam, log, progress=False, pictures=False))
+    verdict = km.diagnose(km.record(slam, log, progress=False))
     assert verdict.map == "doubtful"
     assert [cause.evidence for cause in verdict.causes] == ["none of the 39 observations was used"]
 
@@ -749,7 +743,7 @@ def test_scans_that_come_twice_are_named_and_count_once() -> None:
 def test_segments_of_a_long_log_have_scans_enough_of_each_robot() -> None:
     world = load_world("two_robots", ["steps=400"])
     log = simulate(world, 0)
-    run = km.record(build_slam(world.config(), log), log, progress=False, pictures=False)
+    run = km.record(build_slam(world.config(), log), log, progress=False)
     given = subsample(run, batch_input(run), 600)
     assert given.segments is not None and len(given.segments) > 1
     for begin, end in given.segments.tolist():
@@ -782,9 +776,7 @@ def test_noise_of_several_columns_is_no_outliers() -> None:
     overrides = [f"filter.robots.robot.sensors.lidar.sigma_{c}={s}" for c, s in zip(settings, stated, strict=True)]
     world = load_world("thick_cloister", ["steps=120", *overrides])
     log, config = simulate(world, 2), world.config()
-    verdict = km.diagnose(
-        km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
-    )
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
     assert {cause.name for cause in verdict.causes[:3]} == {"range_sigma", "azimuth_sigma", "elevation_sigma"}
     assert verdict.map == "ok"
 
@@ -799,9 +791,7 @@ def test_the_cure_of_a_control_noise_names_the_key_of_its_column() -> None:
 def test_a_map_of_tags_is_judged_by_its_batch_solution() -> None:
     world = load_world("tags_room", ["steps=60", "filter.robots.rig.sensors.camera.sigma_px=0.25"])
     log, config = simulate(world, 2), world.config()
-    verdict = km.diagnose(
-        km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
-    )
+    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
     assert verdict.checked.startswith("batch solution")
     (cause,) = verdict.causes
     assert cause.name == "measurement_sigma"
@@ -819,9 +809,7 @@ def test_bearings_alone_accuse_no_odometry() -> None:
     )  # fmt: skip
     world = load_world("random_field", settings)
     log, config = simulate(world, 1), world.config()
-    assert not km.diagnose(
-        km.record(build_slam(config, log), log, progress=False, pictures=False, config=config_dict(config))
-    ).causes
+    assert not km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config))).causes
 
 
 def test_a_gate_that_is_tight_makes_no_noise_too_large() -> None:

@@ -21,9 +21,7 @@ def run_of(begin: int, end: int, every: int = 1, fixes: bool = False) -> Run:
             y = rng.uniform(-2000.0, 2000.0, 2)
         events.append(km.Fix(t_s + 1, "r", y, 0.25 * np.eye(2)) if fixes else km.Scan(t_s + 1, "r", "gps", y[None]))
     sensors = {"gps": km.Mount(km.sensors.Gps2D(0.5))}
-    return km.record(
-        km.Slam(km.Robot("r", km.motion.Unicycle(0.05, 0.02), sensors=sensors)), events, progress=False, pictures=False
-    )
+    return km.record(km.Slam(km.Robot("r", km.motion.Unicycle(0.05, 0.02), sensors=sensors)), events, progress=False)
 
 
 @pytest.mark.parametrize("fixes", [False, True], ids=["readings", "fixes"])

@@ -34,7 +34,7 @@ def lost_run(tmp_path: Path) -> Run:
         y = km.geometry.observe(np.zeros(3), GARDEN)[0] + rng.normal(size=(6, 2)) * [0.05, 0.01]
         events.append(km.Scan(100 + t, "cart", "lidar", y) if t != 6 else km.Scan(100 + t, "cart", "lidar", ()))
     events[6] = km.Control(106, "cart", events[6].u, events[6].cov)  # type: ignore[union-attr]
-    run = km.record(slam_of(), events, progress=False, pictures=False)
+    run = km.record(slam_of(), events, progress=False)
     run.save(tmp_path / "run")
     return Run.load(tmp_path / "run")
 
@@ -70,7 +70,7 @@ def test_the_time_may_be_that_of_the_log(tmp_path: Path) -> None:
 def test_a_time_that_the_log_has_is_the_logs_and_the_answer_says_which_it_took(tmp_path: Path) -> None:
     robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.RangeBearing())})
     events = [km.Scan(t, "r", "s", [[3.0, 0.1]], [7]) for t in range(10, 40)]
-    km.record(km.Slam([robot]), events, progress=False, pictures=False).save(tmp_path / "run")
+    km.record(km.Slam([robot]), events, progress=False).save(tmp_path / "run")
     run = Run.load(tmp_path / "run")
     told, since = explain(run, 20.0), explain(run, 5.0)
     assert (told.t_s, since.t_s) == (10.0, 5.0)
@@ -99,9 +99,7 @@ def test_an_average_over_landmarks_has_a_row_for_each_with_its_weight(tmp_path: 
     slam = km.Slam([robot], km.association.Averaged())
     for name, point in zip("ab", [[4.0, 0.0], [4.0, 1.0]], strict=True):
         slam.add_landmark(name, point, 0.05**2 * np.eye(2))
-    run = km.record(
-        slam, [km.Scan(1, "r", "s", [[4.0, 0.45]]), km.Scan(2, "r", "s", [[9.0, 9.0]])], progress=False, pictures=False
-    )
+    run = km.record(slam, [km.Scan(1, "r", "s", [[4.0, 0.45]]), km.Scan(2, "r", "s", [[9.0, 9.0]])], progress=False)
     run.save(tmp_path)
     assert Run.load(tmp_path).evaluate()["associated"] == 1
     with (tmp_path / "associations.csv").open() as file:
@@ -114,7 +112,7 @@ def test_an_average_over_landmarks_has_a_row_for_each_with_its_weight(tmp_path: 
 
 def test_a_run_with_ids_says_what_it_can(tmp_path: Path) -> None:
     robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.RangeBearing())})
-    run = km.record(km.Slam([robot]), [km.Scan(1, "r", "s", [[3.0, 0.1]], [7])] * 2, progress=False, pictures=False)
+    run = km.record(km.Slam([robot]), [km.Scan(1, "r", "s", [[3.0, 0.1]], [7])] * 2, progress=False)
     run.save(tmp_path / "run")
     told = explain(Run.load(tmp_path / "run"), 0.0)
     assert [*told.lines()][2] == "   0 (id 7): new 7"
@@ -129,7 +127,7 @@ def test_what_has_an_id_is_drawn_with_its_landmark_and_d2_as_what_has_none(tmp_p
     y = km.geometry.observe(seen_from, GARDEN)[0]
     noise = rng.normal(size=(6, 2)) * [0.05, 0.01]
     events = [km.Scan(1, "r", "s", y, [*range(6)]), km.Scan(2, "r", "s", y + noise, [*range(6)])]
-    km.record(km.Slam([robot]), events, progress=False, pictures=False).save(tmp_path / "run")
+    km.record(km.Slam([robot]), events, progress=False).save(tmp_path / "run")
     run = Run.load(tmp_path / "run")
     new, told = explain(run, 1.0), explain(run, 2.0)
     assert [fate.compared for fate in new.fates] == [()] * 6
@@ -183,9 +181,7 @@ def pointed_at(T: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def test_a_sensor_that_does_not_tell_distances_explains_itself_without_places(tmp_path: Path) -> None:
     robot = km.Robot("r", km.motion.Odometry2D(), sensors={"s": km.Mount(km.sensors.Bearing())})
-    km.record(km.Slam([robot]), [km.Scan(1, "r", "s", [[0.1]], [7])] * 2, progress=False, pictures=False).save(
-        tmp_path / "run"
-    )
+    km.record(km.Slam([robot]), [km.Scan(1, "r", "s", [[0.1]], [7])] * 2, progress=False).save(tmp_path / "run")
     assert not np.isfinite(explain(Run.load(tmp_path / "run"), 0.0).fates[0].seen_at).any()
     assert main(["explain", str(tmp_path / "run"), "--scan", "0"]) == 0
 
@@ -200,7 +196,7 @@ def test_a_wrong_map_is_noticed_from_the_time_on_when_it_is_wrong() -> None:
             y = km.geometry.observe(np.zeros(3), GARDEN)[0] + rng.normal(size=(6, 2)) * [0.1, 0.02]
             ids = [0, 1, 2, 3, 4, 5] if not wrong or t < 240 else [1, 0, 2, 3, 4, 5]  # two are taken for each other
             events.append(km.Scan(t, "r", "s", y, ids))
-        run = km.record(km.Slam([robot]), events, progress=False, pictures=False)
+        run = km.record(km.Slam([robot]), events, progress=False)
         verdict = km.diagnose(run)
         assert verdict.map == ("wrong" if wrong else "ok")
     assert verdict.causes[0].since_s == pytest.approx(240, abs=5)

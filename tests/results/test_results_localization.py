@@ -39,7 +39,7 @@ def run_of(
             events.append(km.Scan(t_s, "rover", "receiver", [x[:2] + rng.normal(0, 0.5, 2) + off]))
     sensors = {"gyro": km.Mount(km.sensors.Gyro2D(0.005)), "receiver": km.Mount(km.sensors.Gps2D(sigma_m))}
     slam = km.Slam(km.Robot("rover", motion=km.motion.Unicycle(0.1, 0.1), sensors=sensors))
-    return km.record(slam, events, progress=False, pictures=False)
+    return km.record(slam, events, progress=False)
 
 
 def test_a_path_without_landmarks_is_judged_as_a_path(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from results_world import STEP_NS, circle, slam_for, start_of
 
 def warned(log: Log, events: list[Event] | None = None, **options: Any) -> list[str]:
     log = log if events is None else replace(log, events=events)
-    lines: list[str] = record(slam_for(log, **options), log, progress=False, pictures=False).evaluate()["warnings"]
+    lines: list[str] = record(slam_for(log, **options), log, progress=False).evaluate()["warnings"]
     return lines
 
 
@@ -107,7 +107,7 @@ def fixed(log: Log, shift: tuple[float, float], sigma_m: float = 0.1, seed: int 
 def test_good_fixes_are_counted_with_their_nis_and_bring_no_warning() -> None:
     log = circle(steps=100)
     log = replace(log, events=fixed(log, (0.0, 0.0)))
-    summary = record(slam_for(log), log, progress=False, pictures=False).evaluate()
+    summary = record(slam_for(log), log, progress=False).evaluate()
     assert summary["fixes"] == 20
     assert 0.3 < summary["fix_nis_per_dof"] < 2.0
     assert summary["warnings"] == []
@@ -117,7 +117,7 @@ def test_of_fixes_whose_noise_is_far_too_large_it_is_advised_by_how_much() -> No
     log = circle(steps=300)
     for stated_m, told in ((0.1, []), (0.4, [1.5, 4.2])):
         events = [replace(e, cov=np.eye(2) * stated_m**2) if isinstance(e, Fix) else e for e in fixed(log, (0.0, 0.0))]
-        lines = record(slam_for(log), replace(log, events=events), progress=False, pictures=False).evaluate()["advice"]
+        lines = record(slam_for(log), replace(log, events=events), progress=False).evaluate()["advice"]
         found = [
             re.match(r"fixes: NIS \S+ where 1 is expected: their sigma is stated at least (\S+) times", x)
             for x in lines
@@ -150,7 +150,7 @@ def advised(log: Log, range_: float, bearing: float, control: float = 1.0) -> li
     motion = Unicycle(sigma_v_mps=0.05 * control, sigma_w_radps=0.02 * control)
     start = start_of(("rover",), "rover")
     slam = Slam([Robot("rover", motion, start=start, sensors={"lidar": Mount(lidar)})])
-    lines: list[str] = record(slam, log, progress=False, pictures=False).evaluate()["advice"]
+    lines: list[str] = record(slam, log, progress=False).evaluate()["advice"]
     return lines
 
 
@@ -188,14 +188,14 @@ def test_of_two_sensors_the_one_with_the_wrong_noise_is_named() -> None:
     events = [e for e in log if not (isinstance(e, Scan) and e.t_ns % (2 * STEP_NS) == 0)]
     motion = Unicycle(sigma_v_mps=0.05, sigma_w_radps=0.02)
     slam = Slam([Robot("rover", motion, start=start_of(("rover",), "rover"), sensors=sensors)])
-    run = record(slam, replace(log, events=sorted([*events, *eye], key=sort_key)), progress=False, pictures=False)
+    run = record(slam, replace(log, events=sorted([*events, *eye], key=sort_key)), progress=False)
     assert only(run.evaluate()["advice"]).startswith("sensor eye: NIS ")
 
 
 def test_advice_is_kept_with_a_run_and_shown_in_its_report(tmp_path: Path) -> None:
     log = circle(steps=60)
     events: list[Event] = [scan(e, cov=np.diag([0.2, 0.1]) ** 2) if isinstance(e, Scan) else e for e in log]
-    run = record(slam_for(log), replace(log, events=events), progress=False, pictures=False)
+    run = record(slam_for(log), replace(log, events=events), progress=False)
     verdict = diagnose(run)
     run.save(tmp_path)
     page = (tmp_path / "report.html").read_text()
@@ -218,7 +218,7 @@ def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(
         return process(event)
 
     monkeypatch.setattr(slam, "process", refuse)
-    run = record(slam, log, progress=False, pictures=False)
+    run = record(slam, log, progress=False)
     assert run.evaluate()["warnings"][0] == "the filter stopped: the innovation is <absurd>"
     page = report_html(run)
     assert '<ul class="warnings"><li>the filter stopped: the innovation is &lt;absurd&gt;</li>' in page
@@ -229,7 +229,7 @@ def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(
 def test_warnings_and_fixes_outlive_saving(tmp_path: Path) -> None:
     log = circle(steps=50)
     log = replace(log, events=fixed(log, (11.0, 2.0)))
-    run = record(slam_for(log), log, progress=False, pictures=False)
+    run = record(slam_for(log), log, progress=False)
     run.save(tmp_path)
     loaded = Run.load(tmp_path)
     assert run.summary["warnings"]
@@ -246,7 +246,7 @@ def test_a_diverged_run_is_not_to_be_used() -> None:
 
 def test_what_a_camera_s_attention_leaves_alone_is_no_warning() -> None:
     log = spiral(steps=10)
-    run = record(results_space.slam_for(log), log, progress=False, pictures=False)
+    run = record(results_space.slam_for(log), log, progress=False)
     count = len(run.history.step)
     for reason, warns in (("not among the 10 of most information", False), ("no such landmark", True)):
         history = replace(run.history, outcome=np.full(count, "ignored"), reason=np.full(count, reason))
@@ -256,7 +256,7 @@ def test_what_a_camera_s_attention_leaves_alone_is_no_warning() -> None:
 
 def test_measurements_outside_the_image_are_noticed() -> None:
     slam, log = results_space.with_camera(spiral(steps=10))
-    run = record(slam, log, progress=False, pictures=False)
+    run = record(slam, log, progress=False)
     assert run.evaluate()["warnings"] == []
     (camera,) = run.history.cameras
     history = replace(run.history, cameras=(camera._replace(size=(320.0, 240.0)),))
@@ -267,5 +267,5 @@ def test_measurements_outside_the_image_are_noticed() -> None:
 def test_a_sensor_that_notices_that_its_robot_stands_needs_no_observations() -> None:
     world = load_world("stop_and_go", ["steps=60"])
     log, config = simulate(world, seed=1), world.config()
-    run = record(build_slam(config, log), log, config=config_dict(config), progress=False, pictures=False)
+    run = record(build_slam(config, log), log, config=config_dict(config), progress=False)
     assert not [line for line in run.evaluate()["warnings"] if "still" in line]

@@ -127,7 +127,7 @@ def test_scans_with_ids_that_are_given_again_count_once_and_are_named() -> None:
         events.append(km.Scan(0.1 * k, "r", "lidar", y, [1, 2, 3]))
     lidar = km.Mount(km.sensors.RangeBearing(0.05, 0.01))
     slam = km.Slam([km.Robot("r", MOTION, (0, 0, 0), {"lidar": lidar})])
-    run = km.record(slam, Log("held", ("r",), events), progress=False, pictures=False)
+    run = km.record(slam, Log("held", ("r",), events), progress=False)
     verdict = km.diagnose(run)
     (cause,) = [cause for cause in verdict.causes if cause.name == "copies"]
     assert cause.harmless and "of 200 scans of r.lidar repeat" in cause.evidence
