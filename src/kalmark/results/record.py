@@ -76,8 +76,8 @@ def record(
     that diverges so far that it refuses to go on ends the run in either case: `run.stopped` is the reason and the
     summary has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's
     models.  Without `pictures` the maps on the way and what was in view are left out, which is faster; the verdict
-    on such a run does not know the map before a jump.  Raises LogError if the log has other columns than the
-    filter's motions and sensors, or two units of time.
+    on such a run is without the map before a jump.  Raises LogError if the log has other columns than the filter's
+    motions and sensors, or two units of time.
 
     >>> rover = km.Robot("rover", km.motion.Unicycle())
     >>> drive = [km.Control(t_s=0.1 * k, robot="rover", u=(0.5, 0.02)) for k in range(4)]
