@@ -40,12 +40,12 @@ mathjax_path = "mathjax/tex-chtml.js"
 mathjax3_config = {"options": {"enableMenu": False}}
 
 # A page of the course or a tutorial is a program: course/CHAPTER/plot_NAME.py, tutorials/plot_NAME.py
+CHAPTERS = ["guide", "exercises", "slides", "toolbox"]
 sphinx_gallery_conf = {
-    "examples_dirs": ["course", "tutorials"],
-    "gallery_dirs": ["lessons", "how"],
+    "examples_dirs": [*(f"course/{chapter}" for chapter in CHAPTERS), "tutorials"],
+    "gallery_dirs": [*(f"lessons/{chapter}" for chapter in CHAPTERS), "how"],
     "filename_pattern": r"plot_",
     "within_subsection_order": "FileNameSortKey",
-    "subsection_order": ["course/guide", "course/exercises", "course/slides", "course/toolbox"],
     "download_all_examples": False,
     "remove_config_comments": True,
     "show_memory": False,
