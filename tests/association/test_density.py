@@ -11,8 +11,8 @@ import kalmark as km
 from kalmark.association.posterior import Posterior, posterior
 from kalmark.association.query import Candidates, Query
 from kalmark.config import build_slam
-from kalmark.geometry.density import log_ball, log_density, log_volume_change
 from kalmark.geometry.gaussian import gate
+from kalmark.geometry.landmark_density import log_ball, log_density, log_volume_change
 from kalmark.logs.formats import hide_ids
 from kalmark.simulate import load_world, simulate
 from kalmark.tracks.track import Tracks

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
 
 from kalmark import geometry as g
 from kalmark.geometry.spaces import SCALAR, VECTOR
@@ -137,6 +138,44 @@ def test_the_ellipse_lies_at_n_sigmas_and_closes() -> None:
     assert contour.shape == (25, 2)
     np.testing.assert_allclose(contour[0], contour[-1], atol=1e-12)
     np.testing.assert_allclose([g.mahalanobis(p, [1, -1], P) for p in contour], 3.0, rtol=1e-12)
+
+
+def test_the_axes_and_the_angle_of_an_ellipse_are_those_it_was_made_of() -> None:
+    for angle in (-1.5, -0.4, 0.0, 0.7, np.pi / 2):
+        R = g.rotation(angle)
+        axes, found = g.ellipse_axes(R @ np.diag([4.0, 0.25]) @ R.T, sigmas=3)  # (82)
+        np.testing.assert_allclose(axes, [6.0, 1.5], rtol=1e-12)
+        assert np.sin(found - angle) == pytest.approx(0, abs=1e-12)
+        assert -np.pi / 2 < found <= np.pi / 2
+
+
+def test_the_density_of_a_gaussian_is_scipys() -> None:
+    mean, P = np.array([1.0, -2.0]), np.array([[2.0, 0.7], [0.7, 1.0]])
+    x = np.random.default_rng(1).normal(size=(3, 4, 2))
+    np.testing.assert_allclose(g.density(x, mean, P), multivariate_normal(mean, P).pdf(x), rtol=1e-12)
+    assert g.density(x[0, 0], mean, P).shape == ()
+
+
+def test_expectations_are_the_moments_of_a_gaussian() -> None:
+    mean, P = np.array([1.0, -2.0]), np.array([[2.0, 0.7], [0.7, 1.0]])
+    np.testing.assert_allclose(g.expectation(lambda x: x, mean, P), mean, rtol=1e-12)  # (67)
+    np.testing.assert_allclose(g.expectation(lambda x: np.outer(x - mean, x - mean), mean, P), P, rtol=1e-12)  # (68)
+    assert g.expectation(lambda x: np.cos(x[0]), [0.3], [[0.5]]) == pytest.approx(np.exp(-0.25) * np.cos(0.3))
+    assert g.expectation(lambda x: x[0] ** 4, [0.0], [[0.5]], points=3) == pytest.approx(3 * 0.25)
+
+
+def test_propagation_is_exact_of_a_linear_function_and_near_of_a_nearly_linear_one() -> None:
+    F, mean, P = (
+        np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 0.0]]),
+        np.array([2.0, 0.5]),
+        np.array([[2.0, 0.7], [0.7, 1.0]]),
+    )
+    y, Y = g.propagate(lambda x: (F @ x, F), mean, P)
+    np.testing.assert_allclose(y, g.expectation(lambda x: F @ x, mean, P), rtol=1e-12)
+    np.testing.assert_allclose(Y, g.expectation(lambda x: np.outer(F @ x - y, F @ x - y), mean, P), rtol=1e-12)
+    p, near = g.propagate(g.inv_scan, mean, 1e-6 * P)
+    exact = g.expectation(lambda x: np.outer(g.inv_scan(x)[0] - p, g.inv_scan(x)[0] - p), mean, 1e-6 * P)
+    np.testing.assert_allclose(near, exact, rtol=1e-4)
 
 
 def test_the_table_of_sigmas_is_the_guides() -> None:

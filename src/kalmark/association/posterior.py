@@ -2,10 +2,10 @@
 
 A matching of c pairs has the likelihood N(v; 0, Z) of its joint innovation, linearised where the scan itself would be,
 times the density of what is not in the map for each observation that it leaves without a pair: that of the landmarks
-near it (`geometry/density.py`).  The shares of a scan that are of landmarks just seen, of other landmarks of the map,
-and of no landmark have the prior Dirichlet(1/2 + a, 1/2, 1/2): Jeffreys' prior, which favours shares near 0 and 1, and
-a observations of landmarks just seen in the last scans, the `experience`.  The share of the other landmarks among all
-that are not just seen has the prior Beta(1/2, 1/2) for every a.
+near it (`geometry/landmark_density.py`).  The shares of a scan that are of landmarks just seen, of other landmarks of
+the map, and of no landmark have the prior Dirichlet(1/2 + a, 1/2, 1/2): Jeffreys' prior, which favours shares near 0
+and 1, and a observations of landmarks just seen in the last scans, the `experience`.  The share of the other landmarks
+among all that are not just seen has the prior Beta(1/2, 1/2) for every a.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from kalmark.filter.layout import P_AT
 from kalmark.filter.local import append_known
 from kalmark.filter.map import Marginal, Pairs
 from kalmark.filter.observed_block import add_blocks, observed_block
-from kalmark.geometry.density import NEIGHBOURS, log_density, log_volume_change
+from kalmark.geometry.landmark_density import NEIGHBOURS, log_density, log_volume_change
 from kalmark.models.observe import linearize
 from kalmark.report import Compared
 from kalmark.tracks.channel import ObservationModel

@@ -22,7 +22,7 @@ from kalmark.association.protocol import DEFERRED, Decision
 from kalmark.association.query import Query
 from kalmark.events import Id
 from kalmark.filter.map import Map
-from kalmark.geometry.density import NEIGHBOURS, log_density, log_volume_change
+from kalmark.geometry.landmark_density import NEIGHBOURS, log_density, log_volume_change
 from kalmark.tracks.track import Tracks
 
 LOOSE = math.log(10.0)  # above it the place of a pair is so small against the landmarks' spacing that it needs no other

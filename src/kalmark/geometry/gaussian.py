@@ -1,11 +1,12 @@
-"""Gaussians: ellipses, distances, gates, and uncertain transforms compounded, intersected and merged.
+"""Gaussians: density, expectation, propagation, ellipses, distances, gates; operations on uncertain frames.
 
-[S] App. B for ellipses, Mahalanobis distance and gates; Smith and Cheeseman's approximate transformations, as in [T] 2,
-for the rest.  How landmarks are started from them is in `kalmark.management.delayed`.
+[S] App. B up to the gates; Smith and Cheeseman's approximate transformations, as in [T] 2, for the rest.  How
+landmarks are started from them is in `kalmark.management.delayed`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -14,6 +15,59 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, inverse
+
+
+def density(x: Any, mean: Any, cov: Any) -> Array:
+    """Return the density (...) of an n-D Gaussian at x (..., n), of which `mean` is (n,) and `cov` (n, n).  [S] (69).
+
+    >>> float(km.geometry.density([0.0, 0.0], [0.0, 0.0], np.eye(2)).round(3))  # 1 / (2 pi)
+    0.159
+    """
+    P = np.asarray(cov, dtype=np.float64)
+    d = np.asarray(x, dtype=np.float64) - np.asarray(mean, dtype=np.float64)
+    exponent = -0.5 * (d * np.linalg.solve(P, d[..., None])[..., 0]).sum(-1)
+    return np.asarray(np.exp(exponent) / np.sqrt(np.linalg.det(2 * np.pi * P)))
+
+
+def expectation(f: Callable[[Array], Any], mean: Any, cov: Any, points: int = 20) -> Array:
+    """Return E[f(x)], of the shape of f(x), of a Gaussian x with `mean` (n,) and `cov` (n, n).  [S] (66).
+
+    Gauss-Hermite quadrature at `points` places along each axis: exact if f is a polynomial of degree 2 points - 1.
+
+    >>> km.geometry.expectation(lambda x: x**2, [1.0], [[0.25]]).round(3)  # mean^2 + variance
+    array([1.25])
+    """
+    axes, d2, _ = np.linalg.svd(np.asarray(cov, dtype=np.float64))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(points)
+    grid, weight = (np.stack(np.meshgrid(*[each] * len(d2)), axis=-1).reshape(-1, len(d2)) for each in (nodes, weights))
+    x = np.asarray(mean, dtype=np.float64) + (grid * np.sqrt(d2)) @ axes.T
+    return np.tensordot(weight.prod(axis=1) / weights.sum() ** len(d2), np.array([f(each) for each in x]), axes=1)
+
+
+def propagate(f: Callable[[Array], tuple[Array, Array]], mean: Any, cov: Any) -> tuple[Array, Array]:
+    """Return the mean (m,) and covariance (m, m) of f(x) to first order, of x with `mean` (n,) and `cov` (n, n).
+
+    f returns its value (m,) and its Jacobian (m, n).  [S] (76)-(77); if f is linear, exactly (72)-(73).
+
+    >>> p, P = km.geometry.propagate(km.geometry.inv_scan, [2.0, 0.0], np.diag([0.1, 0.2]) ** 2)
+    >>> np.diag(P).round(3)
+    array([0.01, 0.16])
+    """
+    y, F = f(np.asarray(mean, dtype=np.float64))
+    return y, F @ np.asarray(cov, dtype=np.float64) @ F.T
+
+
+def ellipse_axes(cov: Any, sigmas: float = 1.0) -> tuple[Array, float]:
+    """Return the semi-axes (2,), the greater first, of the n-sigma ellipse of `cov` (2, 2), and the angle of that one.
+
+    The angle (rad) is in (-pi/2, pi/2].  [S] (79)-(82), Fig. 8.
+
+    >>> axes, angle = km.geometry.ellipse_axes([[2.5, 1.5], [1.5, 2.5]])
+    >>> axes.round(3), round(angle, 3)
+    (array([2., 1.]), 0.785)
+    """
+    axes, d2, _ = np.linalg.svd(np.asarray(cov, dtype=np.float64))
+    return sigmas * np.sqrt(d2), float(wrap(2 * np.arctan2(axes[1, 0], axes[0, 0])) / 2)
 
 
 def ellipse(mean: Any, cov: Any, sigmas: float = 1.0, points: int = 16) -> Array:

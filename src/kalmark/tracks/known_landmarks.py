@@ -14,7 +14,7 @@ from kalmark.arrays import Array, Index
 from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.nearest_blocks import has_place
-from kalmark.geometry.density import NEIGHBOURS, log_density
+from kalmark.geometry.landmark_density import NEIGHBOURS, log_density
 from kalmark.models.protocols import Landmark, Segmented, place_of
 
 if TYPE_CHECKING:
