@@ -44,7 +44,7 @@ alpha = np.linspace(0, 2 * np.pi, 65)
 circle = np.array([np.cos(alpha), np.sin(alpha)])
 stretched = np.diag([a, b]) @ circle
 steps = [circle, stretched, R @ stretched, (R @ stretched).T + mean]
-figure, axes = plt.subplots(1, 4, figsize=(11, 2.7), layout="constrained", sharex=True, sharey=True)
+figure, axes = plt.subplots(1, 4, figsize=(11, 2.7), layout="tight", sharex=True, sharey=True)
 titles = ["unit circle", "times √D", "times R", "plus the mean"]
 for k, (ax, points, title) in enumerate(zip(axes, steps, titles, strict=True)):
     x, y = points.T if k == 3 else points
