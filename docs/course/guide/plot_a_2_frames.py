@@ -44,11 +44,11 @@ for origin, axes, coordinates, name, colour in (
         ax.annotate("", origin + axes[:, k], origin, arrowprops=style | {"color": colour})
     corner = origin + axes[:, 0] * coordinates[0]
     ax.plot(*np.array([origin, corner, p_W]).T, "--", color=colour, lw=1)
-    ax.text(*(origin + np.array([0.05, -0.4])), name, color=colour, size=14)
+    ax.annotate(name, origin + np.array([0.05, -0.4]), color=colour, size=14)
 ax.annotate("", t, (0, 0), arrowprops=style | {"color": "C3"})
-ax.text(*(t / 2 + np.array([-0.1, 0.15])), "t", color="C3", size=14)
+ax.annotate("t", t / 2 + np.array([-0.1, 0.15]), color="C3", size=14)
 ax.plot(*p_W, "o", color="C2")
-ax.text(*(p_W + 0.1), "p", color="C2", size=14)
+ax.annotate("p", p_W + 0.1, color="C2", size=14)
 ax.set(aspect="equal", xlim=(-0.8, 4), ylim=(-0.6, 4), xlabel="x [m]", ylabel="y [m]")
 
 # %%
