@@ -53,6 +53,7 @@ sphinx_gallery_conf = {
     "min_reported_time": 1e9,
     "write_computation_times": False,
     "plot_gallery": "True",
+    "matplotlib_animations": True,
     "image_srcset": ["2x"],
     "capture_repr": ("_repr_html_",),  # a page shows what it prints
     "copyfile_regex": r".*\.csv",
