@@ -34,31 +34,34 @@ slam, world = km.Slam(robots), np.array([[3.0, 2.5], [4.0, 3.5], [-2.0, -0.5], [
 figure, ax = plt.subplots(figsize=(8, 5), layout="constrained")
 for robot in robots:
     for name, mount in robot.sensors.items():
-        place, _, _ = km.geometry.compose(np.array(robot.start), np.array(mount.at, dtype=float))
-        y, _, _ = km.geometry.observe(place, world)
+        at, _, _ = km.geometry.compose(np.array(robot.start), np.array(mount.at, float))
+        y, _, _ = km.geometry.observe(at, world)
         ids = np.flatnonzero(np.abs(y[:, 1]) < 0.8)  # in the field of view
         scan = km.Scan(t_s=0.0, robot=robot.name, sensor=name, y=y[ids], ids=ids)
         seen = [(o.landmark, o.outcome) for o in slam.process(scan).observations]
         print(f"robot {robot.name}, sensor {name}: {seen}")
-        ax.plot(*place[:2], "ks", ms=5)
-        ax.plot(*np.array([np.tile(place[:2], (len(ids), 1)), world[ids]]).transpose(2, 0, 1), "C7:")
+        ax.plot(*at[:2], "ks", ms=5)
+        ax.plot(*np.swapaxes([at[:2] + 0 * world[ids], world[ids]], 0, 2).swapaxes(1, 2), "C7:")
 
 # %%
 # Figure 1
 # --------
 #
-# Squares are sensors, dotted lines observations, the ellipses have three sigmas. Two landmarks that both robots see
-# connect them: their corrections make the poses of A and B correlated.
+# Squares are sensors, dotted lines observations, the ellipses have three sigmas. Landmarks 0, 1 and 3, which both
+# robots see, connect them: their corrections make the poses of A and B correlated.
 for row in slam.landmarks():
     ax.plot(*km.geometry.ellipse(row.mean, row.covariance, sigmas=3, points=60).T, "C2")
     ax.annotate(f"landmark {row.id}", row.mean + 0.2)
 for robot in robots:
     r, P = slam.mean(robot.name), slam.covariance(robot.name)
-    ax.plot(*r[:2], "k", marker=(3, 0, np.degrees(r[2]) - 90), ms=16, mfc="none")
+    ax.plot(*r[:2], "k", marker=f"${robot.name}$", ms=10)
     ax.plot(*km.geometry.ellipse(r[:2], P[:2, :2], sigmas=3, points=60).T, "k", lw=1)
-    ax.annotate(f"robot {robot.name}", r[:2] + np.array([-0.4, -0.9]))
 ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 # %%
 # Try changing
 # ------------
+#
+# * The sensors of A: ``sensors={"front": front}``. Nobody sees landmark 2, and it is not in the map.
+# * The noise: ``sigma_bearing_rad=0.2``. The ellipse of landmark 2, which one sensor sees, becomes long across its
+#   line of sight.

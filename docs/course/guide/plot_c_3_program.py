@@ -65,7 +65,7 @@ animation = FuncAnimation(figure, draw, frames=range(3, 200, 4), interval=120)
 # Try changing
 # ------------
 #
-# * The noise of the turn: ``np.array([0.01, 0.2])``. The sigma of the heading at the end is 0.018 rad, nearly as before
-#   (0.016): every step is corrected by all landmarks.
-# * The corrections: ``if number in (0, 1): slam.correct(number, Y[i])``. Two landmarks of 36 are enough to keep the error
-#   of the position at 3 cm; its sigma in x grows from 0.064 m to 0.094 m.
+# * The noise of the turn: ``np.array([0.01, 0.2])``. The sigma of the heading at the end is 0.018 rad, nearly as
+#   before (0.016): every step is corrected by all landmarks.
+# * The corrections: ``if number in (0, 1): slam.correct(number, Y[i])``. Two landmarks of 36 are enough to keep the
+#   error of the position at 3 cm; its sigma in x grows from 0.064 m to 0.094 m.
