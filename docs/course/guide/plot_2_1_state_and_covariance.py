@@ -9,7 +9,7 @@ The map is one Gaussian of the robot and all landmarks, [S] (5) and (6):
    x = \begin{bmatrix} \mathcal{R} \\ \mathcal{M} \end{bmatrix}, \qquad
    P = \begin{bmatrix} P_{RR} & P_{RM} \\ P_{MR} & P_{MM} \end{bmatrix}
 
-A control changes the robot's rows and columns only, [S] (9) and (10). An observation of one landmark changes all of
+A control changes the robot's rows and columns only, [S] (9) and (10). An observation of one landmark may change all of
 :math:`P`, [S] (22) and (23).
 """
 
@@ -46,7 +46,8 @@ corrected = slam.P.copy()
 #
 # The square root of each element's size; dark is zero. The landmarks are correlated, since one uncertain pose saw them
 # all. The control changes only the first three rows and columns; the observation of one landmark makes the variances of
-# the robot and of all landmarks smaller.
+# the robot and of that landmark smaller. Those of the other two stay as they are here: what the observation corrects
+# is the error of the last motion, which their variances do not have.
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.6), layout="constrained", sharey=True)
 labels = ["x", "y", "θ", "l₁", "", "l₂", "", "l₃", ""]
 titles = ["before", "after the control", "after l₁ is seen"]

@@ -59,7 +59,7 @@ def draw(step):
     ax.set(xlim=(-6, 6), ylim=(-6, 6), title=f"step {step + 1}")
 
 
-animation = FuncAnimation(figure, draw, frames=range(3, 200, 4), interval=120)
+animation = FuncAnimation(figure, draw, frames=range(3, 200, 8), interval=240)
 
 # %%
 # Try changing
