@@ -12,7 +12,7 @@ from kalmark.geometry.spaces import HEADING, RHO, VECTOR, Space
 from kalmark.models import landmarks
 from kalmark.models.model_check import check_model
 from kalmark.models.pointwise import jacobian
-from kalmark.models.protocols import place_of
+from kalmark.models.protocols import HasPlace, place_of
 from kalmark.models.sensors import RangeBearing
 from kalmark.slam.robot import Mount
 
@@ -101,3 +101,16 @@ def test_a_sensor_of_the_state_that_would_be_taken_for_one_of_landmarks_is_refus
         Mount(Compass())
     with pytest.raises(ModelError, match="Compass has views and no pass_share"):
         check_model(Compass(), np.random.default_rng(0))
+
+
+class _Limited(RangeBearing):
+    def __init__(self, far: bool) -> None:
+        super().__init__()
+        if far:
+            self.__dict__["place"] = lambda l: l
+
+
+def test_instances_of_one_class_may_have_other_capabilities() -> None:
+    found = [isinstance(_Limited(far), HasPlace) for far in (False, True, False)]
+    assert found == [False, True, False]
+    assert not isinstance(_Limited, HasPlace) and isinstance(landmarks.Tag, HasPlace) is hasattr(landmarks.Tag, "place")

@@ -62,5 +62,7 @@ for ax, P, title in zip(axes, (before, moved, corrected), titles, strict=True):
 # Try changing
 # ------------
 #
-# * The noise of the turn: ``Q = np.diag([0.2, 0.3]) ** 2``. Which rows of P grow?
-# * The landmark that is seen: ``slam.correct(2, ...)``. Which of the others gain most?
+# * The noise of the turn: ``Q = np.diag([0.2, 0.3]) ** 2``. After the control the sigma of the heading is 0.304 rad in
+#   place of 0.112; those of the position stay.
+# * The landmark that is seen: ``slam.expect(2)`` and ``slam.correct(2, ...)``. The third landmark becomes more certain
+#   (0.160 and 0.150 m to 0.158 and 0.137 m) in place of the first.
