@@ -24,6 +24,7 @@ extensions = [
     "sphinx_design",
     "project_pages",
     "api_pages",
+    "course_pages",
 ]
 exclude_patterns = ["course", "tutorials", "site", "**/*.ipynb"]
 root_doc = "index"

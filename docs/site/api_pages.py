@@ -71,6 +71,17 @@ def write(folder: Path) -> None:
             file.write_text(text)
 
 
+def pages() -> dict[str, str]:
+    """Return the page of each public name, as `km.geometry.move`, and of each module."""
+    shown = {shown.replace("kalmark", "km", 1) if shown == "kalmark" else shown: shown for _, shown, _ in PARTS}
+    named = {
+        f"{short}.{name}": _page(full, name, thing)
+        for (short, full), (_, _, module) in zip(shown.items(), PARTS, strict=True)
+        for name, thing in public_names(module).items()
+    }
+    return shown | named
+
+
 def public_names(module: str) -> dict[str, Any]:
     """Return the names that a module lists, those of plug-ins included, without modules."""
     home = import_module(module)

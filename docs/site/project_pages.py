@@ -21,6 +21,7 @@ def link(app: Any, name: str, source: list[str]) -> None:
     """Point the pages to these instead of the files above them, and to the page of a program."""
     for file, page in FILES.items():
         source[0] = source[0].replace(f"](../{file}", f"]({page}")
+    source[0] = source[0].replace("](course/items.csv)", "](lessons/items.md)")
     source[0] = re.sub(r"\]\(course/(\w+)/\)", r"](lessons/\1/index.rst)", source[0])
     for programs, shown in (("tutorials", "how"), ("course", "lessons")):
         source[0] = re.sub(rf"\]\({programs}/([\w/]+)\.py\)", rf"]({shown}/\1.rst)", source[0])
