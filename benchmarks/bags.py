@@ -29,11 +29,10 @@ from kalmark.bags.run_messages import export
 from kalmark.bags.survey import survey
 from kalmark.bags.tagslam import SIGMA, Scene, frame_of, read_cameras, read_scene
 from kalmark.config import build_slam, open_run
-from kalmark.events import Scan
+from kalmark.events import Scan, fixed_seconds
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs import Log, find_data, open_log
-from kalmark.logs.source import seconds_text
 from kalmark.results.record import record
 from kalmark.slam.slam import Slam
 
@@ -109,7 +108,7 @@ def edited(lines: list[str], where: Path, own: Log) -> list[str]:
     size = f"size_m: {usual}" + (f", sizes: {json.dumps(others)}" if others else "")
     ignored: dict[int, list[str]] = {}
     for t_ns, tag in sorted(scene.squashed):
-        ignored.setdefault(tag, []).append(seconds_text(t_ns))
+        ignored.setdefault(tag, []).append(fixed_seconds(t_ns))
     size += f", ignore: {json.dumps(ignored)}" if ignored else ""
     noise = odometry_noise(scene, scans)
     out = [re.sub(r"size_m: [0-9.]+", size, line) for line in lines]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import subprocess
 import sys
@@ -11,8 +12,9 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+import kalmark as km
 from kalmark.config import load_config, open_run, resolve_config, shipped_configs
-from kalmark.config.schema import options_of_formats
+from kalmark.config.schema import LogConfig, options_of_formats
 from kalmark.config.tree import name_of, name_on
 from kalmark.errors import ConfigError
 from kalmark.logs import known_formats
@@ -320,3 +322,11 @@ def test_a_file_is_called_by_its_name_or_by_its_folder_if_all_such_files_have_th
     assert name_of(Path("worlds/config.yaml"), "world") == "config"
     assert (name_of(Path("/config.yaml"), "config"), name_of(None, "world")) == ("config", "world")
     assert (name_on("woods", "log"), name_on("log", "log")) == ("woods on log", "log")
+
+
+def test_the_options_of_any_log_are_those_of_open_log() -> None:
+    parameters = inspect.signature(km.open_log).parameters.values()
+    options = {each.name: each.default for each in parameters if each.kind is each.KEYWORD_ONLY} | {"format": None}
+    declared = {name: field.default for name, field in LogConfig.model_fields.items()}
+    assert options.keys() - {"progress"} == declared.keys() - {"path"}
+    assert {name for name in declared.keys() & options.keys() if declared[name] != options[name]} == {"increments"}

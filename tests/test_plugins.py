@@ -43,6 +43,20 @@ def last_stop(log: Path) -> None:
     """Print the time of the last event of a log."""
     print(km.open_log(log).events[-1].t_ns)
 '''
+KEY = '''"""Stop at which the tram waits."""
+
+
+def complete(tree):
+    for sensor in tree.values["robots"]["each"]["sensors"].values():
+        sensor.setdefault("sigma_range_m", 0.25)
+
+
+def with_events(config, log):
+    for name, sensor in config.robots["each"].sensors.items():
+        if sensor.stop != "Main Square":
+            raise config.error(("robots", "each", "sensors", name, "stop"), f"got {sensor.stop!r}, expected a stop")
+    return log
+'''
 POINTS = """[kalmark.formats]
 tram = trams:TRAM
 broken = trams:NOTHING
@@ -52,6 +66,9 @@ trams = trams
 
 [kalmark.verbs]
 last-stop = trams:last_stop
+
+[kalmark.keys]
+stop = stops
 
 [kalmark.names]
 Tram = trams:Tram
@@ -91,6 +108,7 @@ def python(code: str, folder: Path, *arguments: str) -> subprocess.CompletedProc
 def trams(tmp_path: Path) -> Path:
     """Return a folder with an installed package, as pip leaves one."""
     (tmp_path / "trams.py").write_text(OWN)
+    (tmp_path / "stops.py").write_text(KEY)
     (tmp_path / "trams-1.dist-info").mkdir()
     (tmp_path / "trams-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: trams\nVersion: 1\n")
     (tmp_path / "trams-1.dist-info" / "entry_points.txt").write_text(POINTS)
@@ -127,6 +145,29 @@ except km.KalmarkError as error:
         "log option 'steps' is unknown to tram, expected step_s; did you mean 'step_s'?",
         "log format is 'broken': 'broken' of trams:NOTHING cannot be loaded: module 'trams' has no attribute 'NOTHING'",
     ], done.stderr
+
+
+def test_a_package_adds_a_key_of_sensors(trams: Path) -> None:
+    sensor = "{type: range_bearing, stop: %s}"
+    tram = f"log: {{path: day.tram}}\nrobots: {{each: {{motion: {{type: tram}}, sensors: {{laser: {sensor}}}}}}}\n"
+    (trams / "day.yaml").write_text(tram % "Main Square")
+    (trams / "wrong.yaml").write_text(tram % "Station")
+    code = """
+from kalmark import KalmarkError
+from kalmark.config import documentation, open_run
+
+print(open_run("day.yaml")[0].robots["each"].sensors["laser"].sigma_range_m)
+print("| `stop` | Stop at which the tram waits. |" in documentation.page())
+try:
+    open_run("wrong.yaml")
+except KalmarkError as error:
+    print(error)
+"""
+    done = python(code, trams)
+    assert done.returncode == 0, done.stderr
+    sigma, documented, wrong = done.stdout.splitlines()
+    assert (sigma, documented) == ("0.25", "True")
+    assert wrong.endswith("wrong.yaml:2:84: robots.each.sensors.laser.stop: got 'Station', expected a stop")
 
 
 def test_the_core_simulates_runs_saves_and_reloads_without_the_plug_ins(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, field
+from decimal import Decimal
 from itertools import groupby
 from numbers import Real
 from operator import attrgetter
@@ -61,10 +62,14 @@ def refuse_huge(value: Array, columns: tuple[str, ...], where: str) -> None:
             raise EventError(f"{where}: {column} is {worst:.3g}, expected {bound(column)}")
 
 
+def fixed_seconds(t_ns: int) -> str:
+    """Return integer nanoseconds as text in seconds, exactly, with nine decimals."""
+    return f"{Decimal(int(t_ns)).scaleb(-9):.9f}"
+
+
 def seconds_text(t_ns: int) -> str:
     """Return integer nanoseconds as text in seconds, exactly, without trailing zeros."""
-    whole, rest = divmod(abs(t_ns), 1_000_000_000)
-    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}".rstrip("0").rstrip(".")
+    return f"{Decimal(int(t_ns)).scaleb(-9).normalize():f}"
 
 
 def list_names(names: Iterable[object], most: int = 3) -> str:

@@ -5,7 +5,7 @@
 | `kalmark.formats` | a `kalmark.logs.source.Format` of logs, under its name |
 | `kalmark.models` | a module that registers models (`kalmark.register`) |
 | `kalmark.layouts` | a layout of simulated worlds, under its `type` |
-| `kalmark.keys` | what a key of a sensor does: a module with `complete(tree)` and `with_events(config, log)` |
+| `kalmark.keys` | a key of sensors: a module with `complete(tree)` and `with_events(config, log)` |
 | `kalmark.verbs` | a function of the command line |
 | `kalmark.writers` | what `kalmark convert` writes, under the ending of its file: `(path, log, run) -> {part: count}` |
 | `kalmark.names` | a name of the package `kalmark` |

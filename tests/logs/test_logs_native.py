@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Scan, sort_events, sort_key
+from kalmark.events import Control, Event, Fix, Scan, fixed_seconds, sort_events, sort_key
 from kalmark.logs import Log, PositionTrack, Trajectory, open_log, write_native
-from kalmark.logs.source import nanoseconds_of_text, seconds_text
+from kalmark.logs.source import nanoseconds_of_text
 from native_logs import GOOD, HEAD, native
 
 
@@ -191,7 +191,7 @@ def test_any_controls_and_scans_come_back(
 
 @given(times)
 def test_times_are_written_and_read_exactly(t_ns: int) -> None:
-    assert nanoseconds_of_text(seconds_text(t_ns)) == t_ns
+    assert nanoseconds_of_text(fixed_seconds(t_ns)) == t_ns
 
 
 def test_times_are_read_exactly_in_every_notation() -> None:

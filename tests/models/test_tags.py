@@ -156,7 +156,7 @@ def test_a_small_tag_has_two_poses_and_the_better_one_is_kept(rng: np.random.Gen
     for _ in range(100):
         y = seen(lens, v, par) + 0.3 * rng.normal(size=8)
         found, _, rms, ambiguity = tag_pose(lens, y, SIZE, par, 0.3)
-        true = tags.refine_pose(lens, y, SIZE, v, par)[2]
+        true = tags.refine_tag_pose(lens, y, SIZE, v, par)[2]
         assert rms <= math.sqrt(true / 4) * (1 + 1e-9)
         ratios.append(ambiguity)
         better += np.linalg.norm(frames3d.minus(found, v)[3:]) < 0.5

@@ -41,14 +41,14 @@ from kalmark.bags.topics import (
 )
 from kalmark.declare import Values
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Fix, Frame, Scan, sort_key
+from kalmark.events import Control, Fix, Frame, Scan, fixed_seconds, sort_key
 from kalmark.geometry import rotations
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.geodesy import fault, to_tangent_plane
 from kalmark.logs.image_files import Forward
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.source import Format, Request, seconds_text
+from kalmark.logs.source import Format, Request
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import BEAM, POSE3, POSITION
 
@@ -150,7 +150,7 @@ class _Importer:
             with refuse_undeclared_fields():
                 self.taken(received, topic, offer, t_ns)
         except (Refused, EventError) as refused:
-            at = f"{received.topic} at t={seconds_text(t_ns)} s"
+            at = f"{received.topic} at t={fixed_seconds(t_ns)} s"
             self.request.refuse(f"{self.bag.path}: {at}: {refused}")
 
     def taken(self, received: Received, topic: Topic, offer: Message, t_ns: int) -> None:

@@ -15,9 +15,8 @@ from kalmark.bags.messages import Measured, Message
 from kalmark.bags.opening import Received
 from kalmark.bags.topics import Compass, Imu, InertialTopic, Sparse
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Scan
+from kalmark.events import Control, Event, Scan, fixed_seconds
 from kalmark.geometry import rotations
-from kalmark.logs.source import seconds_text
 from kalmark.logs.table import Refused
 
 
@@ -34,7 +33,7 @@ class Gathered:
         if before_ns is None or t_ns > before_ns:
             return True
         if t_ns < before_ns:
-            raise Refused(f"time after {seconds_text(before_ns)} s, expected times that never run backwards")
+            raise Refused(f"time after {fixed_seconds(before_ns)} s, expected times that never run backwards")
         self.left_out[received.topic, f"{what} at the time of the one before"] += 1
         return False
 

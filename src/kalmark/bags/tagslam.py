@@ -254,7 +254,7 @@ def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
                 pose = pose_of(one.transform.translation, one.transform.rotation)
                 last[one.header.frame_id, one.child_frame_id] = pose
     if world != "map":
-        track = [(t_ns, relative_frame(pose, last["map", rig])) for t_ns, pose in track]
+        track = [(t_ns, frame_between(pose, last["map", rig])) for t_ns, pose in track]
     tags: dict[Id, Array] = {
         int(child.removeprefix("tag_")): pose if parent == world else compose(last["map", parent], pose)[0]
         for (parent, child), pose in last.items()
@@ -265,7 +265,7 @@ def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
     return Reference(path, tags, cameras)
 
 
-def relative_frame(a: Array, b: Array) -> Array:
+def frame_between(a: Array, b: Array) -> Array:
     """Return the frame b in the frame a."""
     return compose(inverse(a)[0], b)[0]
 
@@ -300,7 +300,7 @@ def rig_increments(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
 
     t_ns = np.unique([scan.t_ns for scan in scans])
     rig = [compose(pose, inverse(moved.T)[0])[0] for pose in moved.path.at(t_ns, max_gap_s=1e9)]
-    steps = np.array([relative_frame(*pair) for pair in pairwise(rig)]).reshape(-1, 7)
+    steps = np.array([frame_between(*pair) for pair in pairwise(rig)]).reshape(-1, 7)
     u = np.column_stack([steps[:, :3], Rotation.from_quat(steps[:, 3:]).as_rotvec()])
     N = np.diag(np.square(3 * [moved.sigma_m] + 3 * [moved.sigma_rad]))
     covs = N * (np.diff(t_ns) * 1e-9)[:, None, None]

@@ -11,7 +11,7 @@ import typer
 from kalmark.cli.shared import (
     Overrides,
     announce_compilation_elsewhere,
-    figure_text,
+    cell_text,
     limit_blas_threads,
     print_table,
     say,
@@ -89,7 +89,7 @@ def print_sweep(sweep: Sweep) -> None:
     head, rows = sweep.table(SHOWN)
     first = sweep.campaigns[0]
     title = f"{first.world}: {first.runs} runs a cell, seed {first.seed}; ANEES (in brackets: of a consistent filter)"
-    texts = [[cell if isinstance(cell, str) else figure_text(cell) for cell in row] for row in rows]
+    texts = [[cell if isinstance(cell, str) else cell_text(cell) for cell in row] for row in rows]
     print_table(title, head, texts, align="<" * (len(sweep.keys) + 1) + ">" * (len(head) - len(sweep.keys) - 1))
 
 
@@ -105,6 +105,6 @@ def print_campaign(campaign: Campaign) -> None:
             band = campaign.band(name) if name in NEES else None
             words = (campaign.label(name) if name in NEES else label, "{:.2f} to {:.2f}".format(*band) if band else "")
             unit = "%" if key.endswith("_inside") else ""
-            rows.append((*words, *(figure_text(figures.get(key), unit) for figures in estimators.values())))
+            rows.append((*words, *(cell_text(figures.get(key), unit) for figures in estimators.values())))
     title = f"{campaign.world}: {campaign.runs} runs, seed {campaign.seed}; ANEES (in brackets: of a consistent filter)"
     print_table(title, ("", "95 % band, one step", *estimators), rows, align="<>" + ">" * len(estimators))

@@ -88,7 +88,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     from kalmark.results.verdict_text import verdict_lines
 
     rows = [
-        (label, figure_text(summary[key], unit), unit)
+        (label, cell_text(summary[key], unit), unit)
         for key, label, unit in TOTALS
         if summary.get(key) is not None and (summary[key] or key not in _SHOWN_IF_ANY)
     ]
@@ -100,7 +100,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         columns = ("robot", *(label for _, label, _ in shown))
         others = {key: value for key, value in summary.items() if isinstance(value, Mapping) and "ate_raw_m" in value}
         named = [*robots.items(), *((f"({name})", figures) for name, figures in others.items())]
-        table = [(name, *(figure_text(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
+        table = [(name, *(cell_text(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
         print_table("", columns, table, align="<" + ">" * len(shown))
         if any(key == "pose_nees" for key, _, _ in shown):
             most = [figure(f["pose_nees_most"], 2) for f in robots.values() if f.get("pose_nees_most") is not None]
@@ -115,7 +115,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     batch: Mapping[str, Any] = summary.get("batch", {})
     if batch:
         figures = {key: value for key, value in batch.items() if key != "pose_differences"}
-        compared = [(label, figure_text(v), unit) for _, label, v, unit in rows_with_labels(figures, BATCH)]
+        compared = [(label, cell_text(v), unit) for _, label, v, unit in rows_with_labels(figures, BATCH)]
         print_table("against the batch solution", ("", "", ""), compared, align="<><")
         if differences := difference_rows(summary):
             print_table(DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, differences, align="<>>>")
@@ -152,7 +152,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]
     console.print(table)
 
 
-def figure_text(value: Any, unit: str = "") -> str:
+def cell_text(value: Any, unit: str = "") -> str:
     """Return a figure as a table shows it."""
     if value is None:
         return "-"

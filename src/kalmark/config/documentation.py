@@ -20,6 +20,7 @@ from kalmark.config.reading import shipped_configs
 from kalmark.config.sections import BASES, Section, section_of
 from kalmark.declare import classes, is_own, unit_of
 from kalmark.logs import known_formats
+from kalmark.plugins import entry_points_of, load
 
 HEAD = """\
 # Configuration
@@ -75,6 +76,8 @@ def page() -> str:
     parts += [_section("`robots.NAME.start`, in the plane", schema.StartConfig)]
     parts += [_section("`robots.NAME.start`, in space", schema.SpaceStartConfig)]
     parts += [_choice("`robots.NAME.motion`", "motion"), _section(f"{of_sensor}`", schema.Mounted)]
+    keys = (f"| `{key}` | {load('keys', key).__doc__} |" for key in entry_points_of("keys"))
+    parts += ["\n".join(("Keys of plug-ins:\n\n| key | meaning |\n|---|---|", *keys, ""))]
     parts += [_section(f"{of_sensor}`, in the plane, too", schema.PlaneMounted, schema.Mounted)]
     parts += [_section(f"{of_sensor}`, in space, too", schema.SpaceMounted, schema.Mounted)]
     parts += [

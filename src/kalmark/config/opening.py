@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.config.reading import ENDINGS, config_of, did_you_mean, resolve_config, shipped_configs
-from kalmark.config.schema import COMMON, TRUTH, Config
+from kalmark.config.schema import TRUTH, Config, LogConfig
 from kalmark.config.tree import EACH, OVERRIDE, Tree, merge_trees, read_tree, tree_of, with_each
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import Raw, Scan
 from kalmark.logs import find_data, known_formats, open_log
 from kalmark.logs.formats import recognise
 from kalmark.logs.log import Log
-from kalmark.plugins import load
-
-OF_PLUGINS = ("images",)  # keys of sensors that a plug-in implements
+from kalmark.plugins import entry_points_of, load
 
 
 def open_run(
@@ -40,7 +38,8 @@ def open_run(
     refuse_idle(tree, log)
     resolve_each(tree, log)
     whole = overlay_on_log(tree, log)
-    parts = [load("keys", name) for name in OF_PLUGINS if any(path[-1] == name for path in whole.places if path)]
+    given = {path[-1] for path in whole.places if path}
+    parts = [load("keys", name) for name in entry_points_of("keys") if name in given]
     for part in parts:
         part.complete(whole)
     config = config_of(whole, path)
@@ -100,11 +99,11 @@ def effective_config(config: Config, log_path: str | Path | None = None) -> Conf
 
 def open_config_log(config: Config, log_path: str | Path | None = None, *, progress: bool = False) -> Log:
     """Return the log that a configuration names, or the one at `log_path` read in the same way."""
-    log, path = config.log, find_log(config, log_path)
+    path, options = find_log(config, log_path), resolve_options(config)
     check_format(config, path)
-    common = log.model_dump(include={*COMMON})
+    common = config.log.model_dump(include={*LogConfig.model_fields} - {"path"})
     common |= {name: resolve_path(config, common[name]) for name in ("truth", "fixes")}
-    found = open_log(path, log.format, **common, **resolve_options(config), progress=progress)
+    found = open_log(path, **common, **options, progress=progress)
     if not found.events:
         raise LogError(f"{path}: true poses alone, expected a log with events; as `log.truth` it scores one")
     return found

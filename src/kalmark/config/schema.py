@@ -247,8 +247,6 @@ class PlaneMounted(Mounted):
 class SpaceMounted(Mounted):
     """Keys of every sensor of space."""
 
-    images: str | None = None
-    """Take the images of this camera of the robot, straightened; intrinsics and mount are that camera's if absent."""
     mount: SpaceMountConfig = SpaceMountConfig()
     """Where the sensor sits on the robot."""
 
@@ -278,11 +276,6 @@ def _three(sigma: float | tuple[float, ...]) -> Any:
     return np.broadcast_to(np.asarray(sigma, dtype=np.float64), 3)
 
 
-# keys of logs of any format
-COMMON = (
-    "robots", "from_s", "to_s", "on_error", "ids", "truth", "fixes", "sigma_fixes_m", "sigma_fixes_z_m", "factors",
-    "shift_s", "increments",
-)  # fmt: skip
 BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]
 
 

@@ -221,6 +221,7 @@ def section_of(role: str, name: str, world: str = "") -> type[Section]:
 def _section(role: str, name: str, world: str, models: tuple[type, ...]) -> type[Section]:
     fields: dict[str, Any] = {} if name == role else {"type": (str, name)}
     if role == "sensor":
+        fields |= {key: (str | None, None) for key in entry_points_of("keys")}  # which their plug-ins check
         fields["detector"] = (Annotated[Any, Choice("detector", sensor=models[0])] | None, None)
     base = BASES.get((role, world), ModelSection)
     for parameter in parameters(models[0]):

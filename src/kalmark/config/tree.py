@@ -20,6 +20,7 @@ from ruamel.yaml.error import MarkedYAMLError
 from ruamel.yaml.reader import ReaderError
 
 from kalmark.errors import ConfigError
+from kalmark.events import short_text
 from kalmark.files import refuse_aliases
 
 EACH = "each"
@@ -125,11 +126,7 @@ def quote_value(value: Any) -> str:
         return "nothing"
     if isinstance(value, bool):
         return str(value).lower()
-    try:
-        text = repr(value)
-    except ValueError:  # an integer of more than 4,300 digits
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= 60 else text[:57] + "..."
+    return short_text(value)
 
 
 def parse_value(text: str, where: str) -> Any:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, figure_text, limit_blas_threads, print_table, say, writable
+from kalmark.cli.shared import Overrides, cell_text, limit_blas_threads, print_table, say, writable
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
@@ -65,9 +65,9 @@ def print_tuning(tuning: Tuning) -> None:
     rows = []
     for label, k in (("the part it was tuned by", 0), ("the part that judges", 1)):
         one, two = tuning.before[k], tuning.after[k]
-        shares = (figure_text(x.left_out, "%") for x in (one, two))
+        shares = (cell_text(x.left_out, "%") for x in (one, two))
         gain = f"{two.likelihood - one.likelihood:+.0f}"
-        rows.append((label, figure_text(one.nis), figure_text(two.nis), gain, *shares))
+        rows.append((label, cell_text(one.nis), cell_text(two.nis), gain, *shares))
     head = ("", "NIS per dof before", "after", "log-likelihood", "left out (%) before", "after")
     print_table("", head, rows, align="<>>>>>")
     for line in correlation_lines(tuning):

@@ -55,10 +55,10 @@ from kalmark.filter.observed_block import (
     innovation,
     joint_innovation,
     least_squares,
+    near_observations,
     observation_of,
     observed_block,
     ravel,
-    select_observations,
     sparse_product,
     squared_distances,
     stack_jacobians,
@@ -294,7 +294,7 @@ def invariant(
     if count == 0:
         return e, z, Z, d2, near, valid
     if count < len(near):
-        slots, y, R = select_observations(near, count, slots, y, R)
+        slots, y, R = near_observations(near, count, slots, y, R)
         index, table, mean, sizes = observed_rows(map_, scan, slots)
         P_ss = submatrix(P, index)
         _e, z_near, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(count, d), y)

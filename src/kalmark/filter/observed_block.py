@@ -241,7 +241,7 @@ def within_gate(d2: Array, gate: float) -> tuple[Flags, int]:
 
 
 @compiled
-def select_observations(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[Index, Array, Array]:
+def near_observations(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[Index, Array, Array]:
     """Return those `count` of slots (K,), measurements y (K, m) and noises R (K, p, p) that are `near`."""
     p = R.shape[1]
     slots_near, y_near, R_near = np.empty(count, np.int64), np.empty((count, y.shape[1])), np.empty((count, p, p))

@@ -37,11 +37,11 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import classes, is_own
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, short_text, sort_events, sort_key
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, fixed_seconds, short_text, sort_events, sort_key
 from kalmark.logs.geodesy import Globe, origin_of
 from kalmark.logs.image_files import Album
 from kalmark.logs.log import Log, PositionTrack, Trajectory
-from kalmark.logs.source import Format, Request, folder_of, read_mapping, seconds_text, spelling_hint
+from kalmark.logs.source import Format, Request, folder_of, read_mapping, spelling_hint
 from kalmark.logs.table import PARQUET, Content, Refused, Row, read_table
 from kalmark.logs.table_columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
 
@@ -359,7 +359,7 @@ def _by_time(path: Path, events: Iterator[Event]) -> Iterator[Event]:
     last_ns = None
     for t_ns, same in groupby(events, key=lambda event: event.t_ns):
         if last_ns is not None and t_ns < last_ns:
-            told = f"an event at {seconds_text(t_ns)} s after one at {seconds_text(last_ns)} s"
+            told = f"an event at {fixed_seconds(t_ns)} s after one at {fixed_seconds(last_ns)} s"
             raise LogError(f"{path}: {told}, expected rows in the order of time: only these can be read one by one")
         last_ns = t_ns
         yield from sorted(same, key=sort_key)

@@ -12,12 +12,12 @@ from ruamel.yaml import YAML
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan
+from kalmark.events import Control, Event, Fix, Frame, Id, Scan, fixed_seconds
 from kalmark.files import replace_folder
 from kalmark.logs.image_files import write_depth, write_image
 from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, RIG
-from kalmark.logs.source import landmark_id, nanoseconds_of_text, seconds_text
+from kalmark.logs.source import landmark_id, nanoseconds_of_text
 from kalmark.logs.table import PARQUET, cov_columns
 from kalmark.logs.table_columns import CANONICAL, GPS, POSE2, POSE3, POSITION
 
@@ -93,7 +93,7 @@ def controls_table(log: Log) -> Table:
     columns = union(check_columns(log.control_columns, c.robot, len(c.u)) for c in events)
     if part := next((c for c in events if c.share < 1), None):
         raise LogError(
-            f"the control at {seconds_text(part.t_ns)} s is a part, expected whole increments: those 'recorded'"
+            f"the control at {fixed_seconds(part.t_ns)} s is a part, expected whole increments: those 'recorded'"
         )
     noise = cov_columns(max((len(c.cov) for c in events if c.cov is not None), default=0))
     rows = [
@@ -116,7 +116,7 @@ def scans_table(log: Log) -> Table:
         key = (s.t_ns, s.robot, s.sensor)
         if key in seen:
             raise LogError(
-                f"two scans of {s.robot!r} by {s.sensor!r} at t={seconds_text(s.t_ns)} s, expected one at a time"
+                f"two scans of {s.robot!r} by {s.sensor!r} at t={fixed_seconds(s.t_ns)} s, expected one at a time"
             )
         seen.add(key)
         begin = time_and_robot(s) | {"sensor": name(s.sensor)}
@@ -168,7 +168,7 @@ def truth(log: Log) -> Table:
         raise LogError("truth holds poses in the plane and in space, expected one kind")
     columns = POSE3 if sizes == {7} else POSE2
     rows = [
-        {"t_s": seconds_text(int(t)), "robot": name(robot)} | texts_of_columns(columns, pose)
+        {"t_s": fixed_seconds(int(t)), "robot": name(robot)} | texts_of_columns(columns, pose)
         for robot, path in log.truth.items() for t, pose in zip(path.t_ns, path.poses, strict=True)
     ]  # fmt: skip
     return ["t_s", "robot", *columns], rows
@@ -188,7 +188,7 @@ def landmarks_table(log: Log) -> Table:
 def gps(log: Log) -> Table:
     """Return header and rows of gps.csv."""
     rows = [
-        {"t_s": seconds_text(int(t)), "robot": name(robot)} | texts_of_columns(GPS, [*xy, *track.antenna])
+        {"t_s": fixed_seconds(int(t)), "robot": name(robot)} | texts_of_columns(GPS, [*xy, *track.antenna])
         for robot, track in log.gps.items() for t, xy in zip(track.t_ns, track.xy, strict=True)
     ]  # fmt: skip
     return ["t_s", "robot", *GPS], rows
@@ -196,7 +196,7 @@ def gps(log: Log) -> Table:
 
 def time_and_robot(event: Event) -> dict[str, str]:
     """Return the cells of an event's time and robot."""
-    return {"t_s": seconds_text(event.t_ns), "robot": name(event.robot)}
+    return {"t_s": fixed_seconds(event.t_ns), "robot": name(event.robot)}
 
 
 def check_columns(columns: dict[Any, tuple[str, ...]], key: Any, size: int) -> tuple[str, ...]:

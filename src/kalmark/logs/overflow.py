@@ -6,9 +6,8 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control
+from kalmark.events import Control, fixed_seconds
 from kalmark.logs.log import Log
-from kalmark.logs.source import seconds_text
 from kalmark.logs.table_columns import WHEELS
 
 BITS = (16, 32)
@@ -26,7 +25,7 @@ def refuse_overflow(log: Log) -> None:
         for name, values in zip(columns, np.array([control.u for control in controls]).T, strict=True):
             for k, bits, step in overflows(values)[:1]:
                 more = -np.sign(values[k]) * 2.0**bits * step
-                told = f"{name} of {robot} at t={seconds_text(controls[k].t_ns)} s is {values[k]:.7g}"
+                told = f"{name} of {robot} at t={fixed_seconds(controls[k].t_ns)} s is {values[k]:.7g}"
                 why = f"a counter of {bits} bits, whose steps are {step:.6g} rad, ran over"
                 raise LogError(
                     f"{log.path or log.name}: {told}: {why}, expected {values[k] + more:.6g}: add {more:.7g}"

@@ -17,7 +17,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import ROUNDED, unit_quaternion
+from kalmark.events import ROUNDED, fixed_seconds, unit_quaternion
 from kalmark.files import write
 from kalmark.geometry.rotations import matrix
 from kalmark.logs.log import Log, Times, Trajectory
@@ -29,7 +29,6 @@ from kalmark.logs.source import (
     nanoseconds_of_text,
     number_of_text,
     read_text,
-    seconds_text,
     text_rows,
     timed_rows,
 )
@@ -120,7 +119,7 @@ def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
             request.refuse(f"{path}:{line}: {error}")
             continue
         if t_ns == last_ns:
-            request.refuse(f"{path}:{line}: time {seconds_text(t_ns)} s twice, expected increasing times")
+            request.refuse(f"{path}:{line}: time {fixed_seconds(t_ns)} s twice, expected increasing times")
         else:
             last_ns = t_ns
             yield t_ns, np.append(values[:3], q)
@@ -181,7 +180,7 @@ def tum_text(t_ns: Times, poses: Array) -> str:
     """Return a path, poses (N, 3) or (N, 7), as TUM lines: t x y z qx qy qz qw."""
     lines = ["# t_s x_m y_m z_m qx qy qz qw"]
     for t, (x, y, z, *q) in zip(t_ns.tolist(), poses_in_space(poses).tolist(), strict=True):
-        lines.append(f"{seconds_text(t)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
+        lines.append(f"{fixed_seconds(t)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
     return "\n".join(lines) + "\n"
 
 
@@ -195,7 +194,7 @@ def write_path(out: Path, t_ns: Times, poses: Array) -> list[Path]:
     for pose in poses_in_space(poses):
         M = np.column_stack([matrix(np.ascontiguousarray(pose[3:])), pose[:3]])
         lines.append(" ".join(f"{value:.12g}" for value in M.ravel()))
-    write(times_beside(out), "".join(f"{seconds_text(int(t))}\n" for t in t_ns))
+    write(times_beside(out), "".join(f"{fixed_seconds(int(t))}\n" for t in t_ns))
     write(out, "\n".join(lines) + "\n")
     return [out, times_beside(out)]
 

@@ -194,12 +194,6 @@ def nanoseconds_of_text(text: str, unit_ns: int = 1_000_000_000) -> int:
     return t_ns
 
 
-def seconds_text(t_ns: int) -> str:
-    """Return integer nanoseconds as text in seconds, exactly, with nine decimals."""
-    whole, fraction = divmod(abs(t_ns), 1_000_000_000)
-    return f"{'-' if t_ns < 0 else ''}{whole}.{fraction:09d}"
-
-
 def landmark_id(text: str) -> Id:
     """Return an id from a file: int if the text is an integer, otherwise the text; or ValueError if it is too long."""
     if len(text) > LONGEST_ID:

@@ -102,8 +102,8 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
     v, V_y, cost = np.full((k, 2, 7), np.nan), np.full((k, 2, 6, 8), np.nan), np.full((k, 2), np.nan)
     for i in range(k):
         first, second = from_homography(rays[i], size[i])
-        a, E_a, cost_a = refine_pose(lens, y[i], size[i], first, par)
-        b, E_b, cost_b = refine_pose(lens, y[i], size[i], second, par)
+        a, E_a, cost_a = refine_tag_pose(lens, y[i], size[i], first, par)
+        b, E_b, cost_b = refine_tag_pose(lens, y[i], size[i], second, par)
         if cost_b < cost_a or math.isnan(cost_a):
             a, b, E_a, E_b, cost_a, cost_b = b, a, E_b, E_a, cost_b, cost_a
         if math.isnan(cost_a):
@@ -123,7 +123,7 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
 
 
 @compiled
-def refine_pose(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple[Array, Array, float]:
+def refine_tag_pose(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple[Array, Array, float]:
     """Minimise |y - e(v)|^2 from a start (7,) by Levenberg's method: v (7,), E_v (8, 6), the least sum; or NaN."""
     v, sizes, damping = start.copy().reshape((1, 7)), np.array([size]), 1e-3
     e, E_v = project_corners(lens, v, sizes, par)

@@ -8,14 +8,14 @@ from contextlib import suppress
 from copy import deepcopy
 from typing import Any
 
-from kalmark.config.opening import OF_PLUGINS, open_config_log
+from kalmark.config.opening import open_config_log
 from kalmark.config.reading import config_of, validate
 from kalmark.config.schema import Config
 from kalmark.config.tree import Tree
 from kalmark.errors import KalmarkError
 from kalmark.events import Frame
 from kalmark.logs.log import Log
-from kalmark.plugins import load
+from kalmark.plugins import entry_points_of, load
 from kalmark.results.history import Camera
 from kalmark.results.recording import Recording
 
@@ -66,6 +66,6 @@ def _read_again(run: Recording) -> Log | None:
         run.run_plugins()
         log = open_config_log(validate(Tree({"log": section}), Config), run.log.path)
         config = config_of(Tree(deepcopy(dict(run.config))), None)
-        for name in OF_PLUGINS:
+        for name in entry_points_of("keys"):
             log = load("keys", name).with_events(config, log)
     return log

@@ -11,9 +11,8 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import RunError
-from kalmark.events import seconds_text as short
+from kalmark.events import fixed_seconds, seconds_text
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.logs.source import seconds_text
 from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth
 from kalmark.report import Candidate
 from kalmark.results.figure_texts import count, figure
@@ -110,7 +109,7 @@ def explain(run: Recording, t_s: float, robot: str | None = None) -> Explanation
     in_log = -AROUND_S <= t_s - begin <= span + AROUND_S
     since = t_s - begin if in_log else t_s
     if not -AROUND_S <= since <= span + AROUND_S:
-        first, last = seconds_text(history.t_ns[0]), seconds_text(history.t_ns[-1])
+        first, last = fixed_seconds(history.t_ns[0]), fixed_seconds(history.t_ns[-1])
         raise RunError(f"scan is {t_s:g} s, expected {first} to {last} s of the log, or 0 to {span:.3f} s since then")
     told = with_known(run, explain_step(run, int(steps[np.argmin(np.abs(t[steps] - since))])))
     return replace(told, asked=f"{t_s:.12g} s {'in the log' if in_log else 'since the first scan'} was asked for")
@@ -165,7 +164,7 @@ def explain_step(run: Recording, step: int) -> Explanation:
     sensor = str(history.sensor[rows[0]]) if len(rows) else ""
     robot, changes = str(history.robot[step]), tuple(c for c in history.changes if c.step == step)
     fates, gates = tuple(fate_of(history, int(row)) for row in rows), _gates(run, robot, sensor, rows)
-    pose, P, when = history.poses[step], history.pose_covariances[step], short(int(history.t_ns[step]))
+    pose, P, when = history.poses[step], history.pose_covariances[step], seconds_text(int(history.t_ns[step]))
     return Explanation(step, float(history.t_s[step]), when, robot, sensor, pose, P, gates, fates, changes)
 
 

@@ -26,10 +26,10 @@ from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
-from kalmark.events import list_names, short_text
+from kalmark.events import fixed_seconds, list_names, short_text
 from kalmark.files import hold_lock, read_arrays, refuse_aliases, replace_file, write
 from kalmark.logs.poses import tum_text
-from kalmark.logs.source import LeftOut, records_of, seconds_text
+from kalmark.logs.source import LeftOut, records_of
 from kalmark.results.history import History
 from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.truth import Truth
@@ -59,7 +59,7 @@ def associations_csv(history: History) -> str:
     Of an observation that was averaged over landmarks, one row each with its weight, which is then a column more.
     """
     steps, landmarks = history.step.tolist(), history.landmark.tolist()
-    times, robots = [seconds_text(t_ns) for t_ns in history.t_ns.tolist()], history.robot.tolist()
+    times, robots = [fixed_seconds(t_ns) for t_ns in history.t_ns.tolist()], history.robot.tolist()
     seen = (column.tolist() for column in (history.sensor, history.index, history.id, history.outcome))
     d2 = ["" if math.isnan(value) else value for value in history.d2.tolist()]  # the writer writes floats by repr
     columns: list[Sequence[Any]] = [[times[s] for s in steps], [robots[s] for s in steps], *seen, landmarks, d2]
@@ -80,7 +80,7 @@ def associations_csv(history: History) -> str:
 def changes_csv(history: History) -> str:
     """Return one row for each landmark that was removed or merged with another: after which scan, and why."""
     rows = [
-        [seconds_text(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
+        [fixed_seconds(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
         for c in history.changes
     ]
     return _csv(CHANGES, rows)

@@ -1,4 +1,4 @@
-"""Sensors that look at the images of another camera of their robot, straightened: lines beside points."""
+"""Images of this camera of the robot, straightened; intrinsics and mount are that camera's if absent."""
 
 from __future__ import annotations
 
