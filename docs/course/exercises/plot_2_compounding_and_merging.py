@@ -18,8 +18,8 @@ This is the law of resistances in series, :math:`R_1 + R_2`, and in parallel, :m
 # Two ways to one place
 # ---------------------
 #
-# One way has four short steps, the other two long ones that keep the direction across better. ``compound`` chains the steps of
-# a way, ``merge`` combines the ends of both.
+# One way has four short steps, the other two long ones that keep the direction across better. ``compound`` chains the
+# steps of a way, ``merge`` combines the ends of both.
 import matplotlib.pyplot as plt
 import numpy as np
 

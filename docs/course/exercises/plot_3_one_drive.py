@@ -2,8 +2,9 @@ r"""
 [T] 3: both filters along one drive
 ===================================
 
-[T] concludes that a filter with all landmarks in its state from the start, with :math:`\Sigma_0 = \operatorname{diag}(0,
-C, \dots, C)`, equals one that begins with the pose alone and augments its state. On the way there are two statements:
+[T] concludes that a filter with all landmarks in its state from the start, with
+:math:`\Sigma_0 = \operatorname{diag}(0, C, \dots, C)`, equals one that begins with the pose alone and augments its
+state. On the way there are two statements:
 
 * A landmark :math:`k` that is not observed yet keeps its mean and its rows and columns of :math:`\Sigma`: its
   cross-covariances are zero, and :math:`F_{x,j}^\top` has zero rows there.
@@ -29,7 +30,7 @@ all_at_once.x, all_at_once.P = np.zeros(15), np.diag([0.0] * 3 + [C] * 12)
 rng, true, numbers, off, pictures = np.random.default_rng(0), np.zeros(3), {}, [], {}
 for step in range(40):
     true = km.geometry.move(true, [0.25, 0.04], [0, 0])[0]
-    u = [0.25, 0.04] + rng.multivariate_normal([0, 0], Q)
+    u = rng.multivariate_normal([0.25, 0.04], Q)
     augmented.predict(u)
     all_at_once.predict(u)
     for j in np.flatnonzero(np.hypot(*(W - true[:2]).T) < 3):

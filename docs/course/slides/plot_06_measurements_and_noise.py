@@ -2,8 +2,8 @@ r"""
 [F] Two kinds of measurement, linearization and noise
 =====================================================
 
-The slides have two measurements of a landmark :math:`(u, v)` by a vehicle :math:`(x, y, \theta)`: distance and heading, or
-its position in the vehicle's frame, by the rotation matrix of :math:`-\theta`:
+The slides have two measurements of a landmark :math:`(u, v)` by a vehicle :math:`(x, y, \theta)`: distance and
+heading, or its position in the vehicle's frame, by the rotation matrix of :math:`-\theta`:
 
 .. math::
 
@@ -70,6 +70,7 @@ axes[0].set(ylabel="second number [rad], [m], [rad]")
 # Try changing
 # ------------
 #
-# * A better heading: ``np.array([0.1, 0.1, 0.03])``. The cloud of the position is hardly bent: 86 % are inside, not 54 %.
+# * A better heading: ``np.array([0.1, 0.1, 0.03])``. The cloud of the position is hardly bent: 86 % are inside, not
+#   54 %.
 # * A landmark that is near: ``np.array([0.3, 0.1])``. 86 % are inside, although the heading is as uncertain as before:
 #   the nearer the landmark, the less its position depends on the heading.

@@ -71,8 +71,8 @@ axes[1].legend(loc="upper right")
 # Try changing
 # ------------
 #
-# * A start on the wrong side: ``"x": [-0.8, 0]``. The whole estimate is the mirror image of the right one, with the same
-#   sigmas. The measurement fits both sides; a filter has one mean, and never finds out.
+# * A start on the wrong side: ``"x": [-0.8, 0]``. The whole estimate is the mirror image of the right one, with the
+#   same sigmas. The measurement fits both sides; a filter has one mean, and it stays on its side.
 # * A better sensor: ``[[0.02**2]]`` and ``0.02 * rng``. The last sigma of the angle falls from 0.070 to 0.020 rad.
 # * A single number for the height: ``1 - np.cos(x[0]) + n[0]`` in brackets is an array of one. ``g`` may return two
 #   numbers as well; ``Sigma_m`` then has two rows.

@@ -22,8 +22,8 @@ The state gets two numbers more, and the covariance two rows and columns:
 # Right surgery, and two that forget something
 # --------------------------------------------
 #
-# ``augment`` does it for any :math:`h`. The second filter forgets the cross-covariance, the third one the uncertainty of
-# the pose, too. Then all three see the landmark again from the same pose, a hundred times.
+# ``augment`` does it for any :math:`h`. The second filter forgets the cross-covariance, the third one the uncertainty
+# of the pose, too. Then all three see the landmark again from the same pose, a hundred times.
 import matplotlib.pyplot as plt
 import numpy as np
 

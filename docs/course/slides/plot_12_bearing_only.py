@@ -42,7 +42,7 @@ axes[0].set(xlim=(-5, 30), ylim=(-6, 6), ylabel="y [m]")
 priors = {"6 m ± 1 m": (6, 1), "6 m ± 4 m": (6, 4), "20 m ± 20 m": (20, 20)}
 for ax, (name, (distance, spread)) in zip(axes, priors.items(), strict=True):
     near = []
-    for run in range(50):
+    for _ in range(50):
         ekf = km.textbook.ExtendedKalmanFilter(None, g, **known)
         ekf.augment(h, np.diag([sigma, spread]) ** 2, sigma * rng.normal(), distance)
         first = km.geometry.ellipse(ekf.x[3:], ekf.Sigma[3:, 3:], 2, 60)
@@ -68,8 +68,8 @@ for ax, (name, (distance, spread)) in zip(axes, priors.items(), strict=True):
 # Try changing
 # ------------
 #
-# * A better sensor: ``np.radians(0.1)``. With the wide prior no run is within 3 sigma, in place of 20 %: the smaller the
-#   noise, the less an error of the linearization is forgiven.
+# * A better sensor: ``np.radians(0.1)``. With the wide prior no run is within 3 sigma, in place of 20 %: the smaller
+#   the noise, the less an error of the linearization is forgiven.
 # * Another distance: ``np.array([12.0, 0.0])``. The narrow prior is wrong now: 0 %, 54 % and 64 %.
 # * More bearings, nearer to each other: ``0.1 * np.arange(1, 31)``. The wide prior is right in 70 % of the runs, since
 #   each correction changes the estimate by less.
