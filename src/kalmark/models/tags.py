@@ -87,7 +87,7 @@ def pose_residual(y: Array, v: Array) -> tuple[Array, Array]:
     return z, E_v
 
 
-@compiled
+@np.errstate(all="ignore")  # corners of no tag are infinite numbers on the way to NaN
 def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array) -> tuple[Array, Array, Array]:
     """Find the two tags whose corners fit y (K, 8): v (K, 2, 7), V_y (K, 2, 6, 8), sums of squares (K, 2) px^2.
 
@@ -96,7 +96,7 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
     from the homography of the corners and from its mirror image, and the lower one comes first.  Where noise has left
     but one, the second is its mirror image, without V_y; its sum is infinite where that is within `FACING`, for then it
     does not matter.  All is NaN where the four pixels are no convex quadrangle of rays ahead.  V_y = (E'E)^-1 E' of
-    Gauss- Newton, so that V_y N V_y' is the covariance for noise N of the pixels.
+    Gauss-Newton, so that V_y N V_y' is the covariance for noise N of the pixels.
     """
     k = len(y)
     v, V_y, cost = np.full((k, 2, 7), np.nan), np.full((k, 2, 6, 8), np.nan), np.full((k, 2), np.nan)
@@ -122,7 +122,6 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
     return v, V_y, cost
 
 
-@compiled
 def refine_tag_pose(lens: int, y: Array, size: float, start: Array, par: Array) -> tuple[Array, Array, float]:
     """Minimise |y - e(v)|^2 from a start (7,) by Levenberg's method: v (7,), E_v (8, 6), the least sum; or NaN."""
     v, sizes, damping = start.copy().reshape((1, 7)), np.array([size]), 1e-3
@@ -148,7 +147,6 @@ def refine_tag_pose(lens: int, y: Array, size: float, start: Array, par: Array) 
     return v[0], E_v[0], cost if math.isfinite(cost) else np.nan
 
 
-@compiled
 def from_homography(m: Array, size: float) -> tuple[Array, Array]:
     """Return both poses (7,) of a tag whose corners are on the rays m (4, 3): the homography's, and its mirror image.
 
@@ -158,13 +156,13 @@ def from_homography(m: Array, size: float) -> tuple[Array, Array]:
     W = _looking_along(m)
     x = np.empty((4, 2))
     for i in range(4):
-        r = W @ m[i].copy()
+        r = W @ m[i]
         if not r[2] > 0.05:
             return nothing, nothing
         x[i] = r[:2] / r[2]
     if not _is_convex(x):
         return nothing, nothing
-    A, b, at = np.zeros((8, 8)), x.copy().reshape(8), corners(2.0)
+    A, b, at = np.zeros((8, 8)), x.reshape(8), corners(2.0)
     for i in range(4):
         for a in range(2):
             row = 2 * i + a
@@ -177,19 +175,12 @@ def from_homography(m: Array, size: float) -> tuple[Array, Array]:
     p, q = p / math.sqrt(2 * np.sum(p * p)), q / math.sqrt(2 * np.sum(q * q))
     Q = np.empty((3, 3))
     Q[:, 0], Q[:, 1] = p + q, p - q
-    Q[:, 2] = np.array(
-        [
-            Q[1, 0] * Q[2, 1] - Q[2, 0] * Q[1, 1],
-            Q[2, 0] * Q[0, 1] - Q[0, 0] * Q[2, 1],
-            Q[0, 0] * Q[1, 1] - Q[1, 0] * Q[0, 1],
-        ]
-    )
+    Q[:, 2] = np.cross(p + q, p - q)
     first = np.empty(7)
     first[:3], first[3:] = H[:, 2] * size / (a0 + a1), from_matrix(Q)
     return first, mirror_pose(first)
 
 
-@compiled
 def mirror_pose(v: Array) -> Array:
     """Return a tag's pose (7,) mirrored in the plane through its centre across the line of sight, and in its own."""
     sight = v[:3] / math.sqrt(np.sum(v[:3] ** 2))
@@ -199,7 +190,6 @@ def mirror_pose(v: Array) -> Array:
     return out
 
 
-@compiled
 def _looking_along(m: Array) -> Array:
     """Return a rotation matrix whose third row is the mean of rays m (4, 3)."""
     z = m[0] + m[1] + m[2] + m[3]
@@ -213,12 +203,10 @@ def _looking_along(m: Array) -> Array:
     return W
 
 
-@compiled
 def _is_convex(x: Array) -> bool:
     """Return whether x (4, 2), in this order, go round a convex quadrangle."""
-    left = 0
-    for i in range(4):
-        a, b = x[(i + 1) % 4] - x[i], x[(i + 2) % 4] - x[(i + 1) % 4]
-        turn = (a[0] * b[1] - a[1] * b[0]) / math.sqrt(np.sum(a * a) * np.sum(b * b))
-        left += 1 if turn > 1e-9 else (-1 if turn < -1e-9 else 0)
-    return abs(left) == 4
+    side = np.roll(x, -1, axis=0) - x
+    after = np.roll(side, -1, axis=0)
+    turn = side[:, 0] * after[:, 1] - side[:, 1] * after[:, 0]
+    least = 1e-9 * np.linalg.norm(side, axis=1) * np.linalg.norm(after, axis=1)
+    return bool(np.all(turn > least) or np.all(turn < -least))
