@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from kalmark.models import landmarks, motion, sensors
     from kalmark.models.pointwise import pointwise
     from kalmark.report import Expectations, Observation, Report
+    from kalmark.results.filter_picture import draw
     from kalmark.results.record import record
     from kalmark.results.run import Run
     from kalmark.slam.robot import Mount, Robot
@@ -38,7 +39,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Attention", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount", "Observation",
-    "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "association", "detect", "estimators", "geometry",
+    "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "association", "detect", "draw", "estimators", "geometry",
     "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record", "register",
     "sensors", "stream_log", "textbook",
 ]  # fmt: skip
@@ -64,6 +65,7 @@ _NAMES = {
     "kalmark.management.upkeep": ("Upkeep",),
     "kalmark.models.pointwise": ("pointwise",),
     "kalmark.report": ("Expectations", "Observation", "Report"),
+    "kalmark.results.filter_picture": ("draw",),
     "kalmark.results.record": ("record",),
     "kalmark.results.run": ("Run",),
     "kalmark.slam.robot": ("Mount", "Robot"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,18 +12,11 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import fixed_seconds, seconds_text
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth
 from kalmark.report import Candidate
 from kalmark.results.figure_texts import count, figure
-from kalmark.results.filter_description import mount_now
+from kalmark.results.filter_description import observed_points
 from kalmark.results.history import History, Ints, LandmarkChange
-from kalmark.results.landmark_table import LINE
 from kalmark.results.recording import Recording
-from kalmark.results.truth import as_rigid
-
-if TYPE_CHECKING:
-    from kalmark.slam.slam import Slam
-
 
 AROUND_S = 1.0  # before the first and after the last scan, a time still means them
 FAR = 30.0  # d2 of a landmark that an observation cannot be of, by whatever gate: it is not drawn, but for the nearest
@@ -129,7 +121,10 @@ def with_known(run: Recording, told: Explanation) -> Explanation:
     except RunError:
         return told
     rows = run.history.step == told.step
-    places, expected = (_seen(slam, told, values[rows]) for values in (run.history.y, run.history.e))
+    places, expected = (
+        observed_points(slam, told.robot, told.sensor, told.pose, values[rows])
+        for values in (run.history.y, run.history.e)
+    )
     fates = list(told.fates)
     for k in open_:
         fate, there = fates[k], np.isfinite(expected[k]).all() and fates[k].landmark
@@ -138,23 +133,6 @@ def with_known(run: Recording, told: Explanation) -> Explanation:
         )
         fates[k] = replace(fate, seen_at=places[k], compared=compared)
     return replace(told, fates=tuple(fates))
-
-
-def _seen(slam: Slam, told: Explanation, y: Array) -> Array:
-    """Return where measurements y (K, m), NaN where there are none, are from the pose after the scan (K, 2 or 3)."""
-    d = 3 if len(told.pose) == 7 else 2
-    out = np.full((len(y), d), np.nan)
-    mount = slam.robots[told.robot].sensors[told.sensor]
-    sensor = mount.sensor
-    known = np.flatnonzero(np.isfinite(y[:, : len(sensor.columns)]).all(axis=1))
-    if not len(known) or not isinstance(sensor, FullSensor) or not finds_depth(sensor):
-        return out
-    v = sensor.invert(np.ascontiguousarray(y[known, : len(sensor.columns)]))[0]
-    if v.shape[1] == LINE or isinstance(sensor, SegmentVisible):  # a line is nowhere in particular
-        return out
-    at = mount_now(slam, told.robot, told.sensor, mount.at)
-    out[known] = as_rigid(told.pose[: len(at)])(as_rigid(at)(v[:, :d]))
-    return out
 
 
 def explain_step(run: Recording, step: int) -> Explanation:

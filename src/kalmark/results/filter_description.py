@@ -13,10 +13,12 @@ from kalmark.events import Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
 from kalmark.logs.log import Log
-from kalmark.models.protocols import parameter_names, self_calibrating
+from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth, parameter_names, self_calibrating
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import Biased, CalibratedMount, Camera, Measuring
+from kalmark.results.landmark_table import LINE
+from kalmark.results.truth import as_rigid
 from kalmark.slam.description import describe
 from kalmark.slam.held_control import bias_name
 
@@ -121,6 +123,26 @@ def mount_now(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
     """Return the mount of a sensor: as given, or as estimated so far if its mount is in the map."""
     name = f"{robot}.{sensor}"
     return np.array(slam.mean(name)[: len(at)] if _in_map(slam, name) else at, dtype=np.float64)
+
+
+def observed_points(slam: Slam, robot: str, sensor: str, pose: Array, y: Array) -> Array:
+    """Return the points (K, 2 or 3) that measurements y (K, m) are of, from a robot's pose, in the frame of the map.
+
+    NaN where y is, and of sensors that do not measure all coordinates of a point.
+    """
+    d = 3 if len(pose) == 7 else 2
+    out = np.full((len(y), d), np.nan)
+    mount = slam.robots[robot].sensors[sensor]
+    model = mount.sensor
+    known = np.flatnonzero(np.isfinite(y[:, : len(model.columns)]).all(axis=1))
+    if not len(known) or not isinstance(model, FullSensor) or not finds_depth(model):
+        return out
+    v = model.invert(np.ascontiguousarray(y[known, : len(model.columns)]))[0]
+    if v.shape[1] == LINE or isinstance(model, SegmentVisible):  # a line is nowhere in particular
+        return out
+    at = mount_now(slam, robot, sensor, mount.at)
+    out[known] = as_rigid(pose[: len(at)])(as_rigid(at)(v[:, :d]))
+    return out
 
 
 def _corners(sensor: Imaging) -> Array:

@@ -21,28 +21,42 @@ from matplotlib.transforms import Affine2D
 
 from kalmark.arrays import Array
 from kalmark.files import replace_file
+from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.landmark_table import LINES, TAG
 from kalmark.results.recording import Recording
-from kalmark.results.scene import FIX_COLOUR, INK, TRUTH_COLOUR, Scene, break_path, contours, join_polylines, squares
+from kalmark.results.scene import (
+    FIX_COLOUR,
+    INK,
+    OUTCOME_COLOURS,
+    TRUTH_COLOUR,
+    Scene,
+    break_path,
+    join_polylines,
+    squares,
+)
 from kalmark.results.verdict_text import alarm
 
-VIEWS = {"normal": (28.0, -55.0), "top": (90.0, -90.0), "side": (0.0, -90.0), "front": (0.0, 0.0)}
+NORMAL = (28.0, -55.0)
+VIEWS = {"normal": NORMAL, "orbit": NORMAL, "top": (90.0, -90.0), "side": (0.0, -90.0), "front": (0.0, 0.0)}
+BEHIND = (20.0, 180.0, 0.25)  # of a robot: elevation and azimuth of the eye, deg, and how far it is, of the box
 LANDMARK_COLOUR = "#d2691e"
 EUCLIDEAN_COLOUR, OTHER_COLOUR, LINE_COLOUR = "#1f5fa8", "#c8412f", "#8c1c13"
-GROUPS = {  # of landmarks that are drawn alike, by the dimensions of the scene
+GROUPS = {  # of landmarks that are drawn alike, by the dimensions of the scene: their colour, its name, their label
     2: (
-        *((LANDMARK_COLOUR, "estimated landmarks, 3σ {}"),) * 2,
-        (LINE_COLOUR, "walls, 3σ of their ends {}"),
+        *((LANDMARK_COLOUR, "landmarks", "estimated landmarks{}"),) * 2,
+        (LINE_COLOUR, "lines", "walls{}"),
     ),
     3: (
-        (EUCLIDEAN_COLOUR, "Euclidean landmarks, 3σ {}"),
-        (OTHER_COLOUR, "landmarks that are not Euclidean, 3σ {}"),
-        (LINE_COLOUR, "lines, 3σ of their ends {}"),
+        (EUCLIDEAN_COLOUR, "landmarks", "Euclidean landmarks{}"),
+        (OTHER_COLOUR, "others", "landmarks that are not Euclidean{}"),
+        (LINE_COLOUR, "lines", "lines{}"),
     ),
 }
 LONG = 3000  # a path of more steps than this is drawn thinner
 CROWD = 100  # with more landmarks than this, everything about them is drawn thinner
+WINDOW = 0.7  # half of the picture from behind a robot, by the distance of the eye
+NEAREST = 0.1  # what is nearer to the eye than this part of the distance of the middle is not drawn
 FEW = 40  # landmarks of space that are labelled
 GROUND, SHADOW, TICK, SOFT = "#d7dbe1", "#c3c8d0", "#7a818c", "#555b66"
 NAMED: dict[str, Any] = {"color": "#1e4d2b", "fontsize": 7, "ha": "center", "va": "bottom", "zorder": 9}
@@ -83,19 +97,19 @@ def save_map(run: Recording, path: str | PathLike[str], world: bool = False) -> 
 
 
 def draw_map(
-    run: Recording, step: int | None = None, view: str | tuple[float, float] = "normal", world: bool = False
+    run: Recording, step: int | None = None, view: str | tuple[float, float] | None = None, world: bool = False
 ) -> Figure:
     """Return the figure of a run's map after a step, by default the last: axes in metres, in the frame of the map.
 
     Ellipses are those of the shape, without what the start leaves open (`kalmark.results.gauge`), or in the `world`.
-    In space `view` is where the left half looks from: "normal", "top", "side", "front" or (elevation, azimuth) in
-    degrees.
+    In space `view` is where the left half looks from (`kalmark.picture_options.Picture`); by default, as all else, by
+    the section `picture` of the run's configuration.
     """
     scene = Scene.of(run, step, world)
     spans = [(scene.high - scene.low)[:2]]
     if scene.d == 3:
         projection = Projection.of(scene, view)
-        spans.insert(0, np.ptp(projection(box_corners(scene.low, scene.high)), axis=0))
+        spans.insert(0, np.subtract(*reversed(projection.frame(scene.low, scene.high))))
     aspects = [float(np.clip(span[0] / span[1], 0.5, 4.0)) for span in spans]
     tall = float(np.clip(INCHES[scene.d] / sum(aspects), 3.0, 8.5))
     width = max(sum(aspects) * tall + 0.2 + 0.65 * len(spans), 6.0)
@@ -134,17 +148,22 @@ def _lines(figures: list[str], width: int) -> list[str]:
     return lines
 
 
-def draw_plan(axes: Axes, scene: Scene) -> None:
-    """Draw a scene as seen from above: x to the right, y up."""
-    axes.set_xlabel("x (m)", color=INK)
-    axes.set_ylabel("y (m)", color=INK)
+def style_axes(axes: Axes, x_label: str, y_label: str) -> None:
+    """Label axes in metres, and draw their grid."""
+    axes.set_xlabel(x_label, color=INK)
+    axes.set_ylabel(y_label, color=INK)
     axes.grid(True, color="#e6e8ec", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.tick_params(colors=SOFT, labelsize=9)
     for side in axes.spines.values():
         side.set_color("#c4c8cf")
+
+
+def draw_plan(axes: Axes, scene: Scene) -> None:
+    """Draw a scene as seen from above: x to the right, y up."""
+    style_axes(axes, "x (m)", "y (m)")
     for stroke in strokes(scene):
-        axes.plot(stroke.points[:, 0], stroke.points[:, 1], **stroke.style)
+        axes.plot(stroke.points[:, 0], stroke.points[:, 1], label=stroke.label or None, **stroke.style)
     for name, point in _labels(scene):
         axes.text(point[0], point[1] + 0.01 * scene.size, name, **NAMED)
     axes.set_xlim(scene.low[0], scene.high[0])
@@ -162,20 +181,17 @@ def strokes(scene: Scene) -> list[Stroke]:
         label = robot if several else f"estimated path{gaps}"
         out.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
         out.append(Stroke(scene.bridges(robot), style | {"linestyle": ":"}))
-    truth = {"color": TRUTH_COLOUR, "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
-    label = f"true path{'s' if several else ''}{scene.how}"
-    out += [
-        Stroke(break_path(scene.truth[robot], scene.stretches[robot]), truth, label, truth) for robot in scene.truth
-    ]
+    out += _true_paths(scene) if scene.picture.truth else []
     small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
     aligned = "position fixes (aligned, not used)"
     out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
     out += [Stroke(fixes, cross, "fixes used", cross | {"markersize": 5}) for fixes in scene.used.values()]
     out += (
-        _true_strokes(scene, truth, crowded)
+        (_true_strokes(scene, crowded) if scene.picture.truth else [])
         + _known_strokes(scene)
         + _landmark_strokes(scene, crowded)
         + _robot_strokes(scene)
+        + (_ray_strokes(scene) if scene.picture.sensors else [])
     )
     if len(scene.unseen):
         cross = _marks("x", ALARM_COLOUR, 3 if crowded else 6, 7) | {"markeredgewidth": 0.8}
@@ -190,11 +206,21 @@ def strokes(scene: Scene) -> list[Stroke]:
     return out
 
 
-def _true_strokes(scene: Scene, style: dict[str, Any], crowded: bool) -> list[Stroke]:
-    points, lines = list(scene.true_points().values()), scene.true_lines()
-    out = []
+def _true_style(scene: Scene) -> dict[str, Any]:
+    return {"color": scene.picture.colour("truth", TRUTH_COLOUR), "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
+
+
+def _true_paths(scene: Scene) -> list[Stroke]:
+    style, label = _true_style(scene), f"true path{'s' if len(scene.paths) > 1 else ''}{scene.how}"
+    lines = [break_path(path, scene.stretches[robot]) for robot, path in scene.truth.items()]
+    return [Stroke(line, style, label, style) for line in lines]
+
+
+def _true_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
+    points, lines, style = list(scene.true_points().values()), scene.true_lines(), _true_style(scene)
+    out = [_robot_mark(scene, pose, style["color"], "true robot", 5.5) for pose in scene.true_ends.values()]
     if points:
-        colour, zorder = (INK, 6) if scene.d == 2 else (TRUTH_COLOUR, 2)
+        colour, zorder = (scene.picture.colour("truth", INK), 6) if scene.d == 2 else (style["color"], 2)
         plus = _marks("+", colour, 4 if crowded else 8, zorder) | {"markeredgewidth": 0.6 if crowded else 1.0}
         out.append(Stroke(np.array(points), plus, f"true landmarks{scene.how}", _marks("+", colour, 7, 1)))
     if lines:
@@ -216,29 +242,25 @@ def _known_strokes(scene: Scene) -> list[Stroke]:
 
 
 def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
-    shapes, out = scene.shapes, []
-    for k, (colour, label) in enumerate(GROUPS[scene.d]):
-        mine = shapes.group == k
+    shapes, picture, out = scene.shapes, scene.picture, []
+    colours = {name: picture.colour(name, usual) for usual, name, _ in GROUPS[scene.d]}
+    for k, (_, name, label) in enumerate(GROUPS[scene.d]):
+        mine, colour = shapes.group == k, colours[name]
         if not mine.any():
             continue
-        rings = np.concatenate(contours(shapes.means[mine], shapes.covariances[mine]))
+        rings = scene.rings(shapes.means[mine], shapes.covariances[mine])
         width, alpha = (0.9, 1.0) if scene.d == 2 else (0.7, 0.55)
         thin = {"linewidth": 0.5 * width, "alpha": 0.75 * alpha} if crowded else {"linewidth": width, "alpha": alpha}
-        sample = {"color": colour, "marker": "."}
-        out.append(
-            Stroke(
-                join_polylines(rings, scene.d),
-                {"color": colour, "zorder": 4, **thin},
-                label.format(scene.of_what),
-                sample,
-            )
-        )
+        said = label.format(scene.how_large(" of their ends" if name == "lines" else ""))
+        out.append(Stroke(rings, {"color": colour, "zorder": 4, **thin}, said, {"color": colour, "marker": "."}))
         out.append(Stroke(shapes.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
     if len(shapes.lines):
-        out.append(Stroke(join_polylines(shapes.lines, scene.d), {"color": LINE_COLOUR, "linewidth": 1.8, "zorder": 5}))
+        out.append(
+            Stroke(join_polylines(shapes.lines, scene.d), {"color": colours["lines"], "linewidth": 1.8, "zorder": 5})
+        )
     if scene.d == 3:
         tags = join_polylines(squares(shapes.tags, scene.size))
-        out.append(Stroke(tags, {"color": EUCLIDEAN_COLOUR, "linewidth": 1.4, "zorder": 5}))
+        out.append(Stroke(tags, {"color": colours["landmarks"], "linewidth": 1.4, "zorder": 5}))
     return out
 
 
@@ -251,17 +273,45 @@ def _robot_strokes(scene: Scene) -> list[Stroke]:
             continue
         colour = scene.colour(robot)
         rim = _marks("o", colour, 7 if d == 2 else 6, 7)
-        starts.append(Stroke(path[:1, :d], rim | disc, "start", _marks("o", INK, 6, 1) | disc))
-        marker, size = (_arrow(float(path[-1, 2])), 15) if d == 2 else ("o", 6)
-        mark = _marks(_arrow(0.0) if d == 2 else "o", INK, 11 if d == 2 else 6, 1)
-        ends.append(Stroke(path[-1:, :d], _marks(marker, colour, size, 8) | {"markeredgecolor": "white"}, "end", mark))
-        ring = join_polylines(contours(path[-1:, :d], scene.pose_covariances[robot][-1:])[0], d)
+        if len(path) > 1 or scene.end == "end":
+            starts.append(Stroke(path[:1, :d], rim | disc, "start", _marks("o", INK, 6, 1) | disc))
+        ends.append(_robot_mark(scene, path[-1], colour, scene.end, 8))
+        ring = scene.rings(path[-1:, :d], scene.pose_covariances[robot][-1:])
         style = {"color": colour if d == 2 else POSE_COLOUR, "linewidth": 0.9, "zorder": 7}
-        rings.append(Stroke(ring, style, f"end, 3σ {scene.of_what}", style | {"color": INK if d == 2 else POSE_COLOUR}))
-        if d == 3:
+        said = f"{scene.end}{scene.how_large()}" if scene.how_large() else ""
+        rings.append(Stroke(ring, style, said, style | {"color": INK if d == 2 else POSE_COLOUR}))
+        if d == 3 and scene.picture.sensors:
             thin = {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}
             rings.append(Stroke(join_polylines(scene.frames(robot)), thin))
     return starts + ends + rings
+
+
+def _robot_mark(scene: Scene, pose: Array, colour: str, label: str, zorder: float) -> Stroke:
+    """Return a robot at a pose (3|7,): a dart along its heading, in space a disc."""
+    marker, size = (_arrow(float(pose[2])), 15) if scene.d == 2 else ("o", 6)
+    sample = _marks(_arrow(0.0) if scene.d == 2 else "o", INK, 11 if scene.d == 2 else 6, 1)
+    sample |= {"color": colour} if label.startswith("true") else {}
+    style = _marks(marker, colour, size, zorder) | {"markeredgecolor": "white"}
+    return Stroke(pose[None, : scene.d], style, label, sample)
+
+
+def _ray_strokes(scene: Scene) -> list[Stroke]:
+    """Return the last scan, by outcome: lines from the sensor to what it saw, and dotted ones from there to landmarks.
+
+    A sensor that does not measure all coordinates has lines to the landmarks.
+    """
+    out = []
+    for outcome in dict.fromkeys(ray.outcome for ray in scene.rays):
+        mine, colour = [ray for ray in scene.rays if ray.outcome == outcome], OUTCOME_COLOURS.get(outcome, INK)
+        beams = [np.array([ray.sensor, ray.seen_at]) for ray in mine if np.isfinite(ray.seen_at).all()]
+        short = [np.array([ray.sensor, ray.landmark]) for ray in mine if not np.isfinite(ray.seen_at).all()]
+        marks = _marks("x", colour, 6, 7) | {"markeredgewidth": 1.4}
+        thin = {"color": colour, "linewidth": 0.8, "alpha": 0.7, "zorder": 3}
+        out.append(Stroke(join_polylines(beams + short, scene.d), thin, f"observation: {outcome}", thin))
+        out.append(Stroke(np.array([ray[1] for ray in beams]).reshape(-1, scene.d), marks))
+        innovations = [np.array([ray.seen_at, ray.landmark]) for ray in mine]
+        out.append(Stroke(join_polylines(innovations, scene.d), thin | {"linestyle": ":", "linewidth": 1.4}))
+    return out
 
 
 def _marks(marker: Any, colour: str, size: float, zorder: float) -> dict[str, Any]:
@@ -281,8 +331,9 @@ def legend(scene: Scene) -> list[Line2D]:
 
 
 def _labels(scene: Scene) -> list[tuple[str, Array]]:
-    """Return the names of the landmarks of space, if they are few, and their places."""
-    if scene.d == 2 or len(scene.ids) > FEW:
+    """Return the names of the landmarks and their places; by default those of space, if they are few."""
+    usual = scene.d == 3 and len(scene.ids) <= FEW
+    if not (usual if scene.picture.labels is None else scene.picture.labels):
         return []
     places = scene.shapes.means[: len(scene.ids)]
     inside = ((places >= scene.low) & (places <= scene.high)).all(axis=1)
@@ -298,18 +349,39 @@ class Projection:
     distance: float
 
     @classmethod
-    def of(cls, scene: Scene, view: str | tuple[float, float] = "normal") -> Projection:
-        """Return the view from (elevation, azimuth), degrees: without perspective from the top and the sides."""
-        elevation, azimuth = np.radians(VIEWS[view] if isinstance(view, str) else view)
+    def of(cls, scene: Scene, view: str | tuple[float, float] | None = None) -> Projection:
+        """Return the view from (elevation, azimuth), degrees: without perspective from the top and the sides.
+
+        "self" is that from behind the first robot, which looks along its x axis.  By default that of the picture.
+        """
+        view = scene.picture.view if view is None else view
+        middle, far = (scene.low + scene.high) / 2, 2.5 * float(np.linalg.norm(scene.high - scene.low))
+        if view == "self":
+            pose = next(path[-1] for path in scene.paths.values())
+            ahead = matrix(np.ascontiguousarray(pose[3:7]))[:, 0]
+            elevation, turned, share = BEHIND
+            degrees = elevation, turned + float(np.degrees(np.arctan2(ahead[1], ahead[0])))
+            middle, far = pose[:3], share * scene.size
+        else:
+            degrees = VIEWS[view] if isinstance(view, str) else view
+            middle, far = (np.zeros(3), np.inf) if view in ("top", "side", "front") else (middle, far)
+        elevation, azimuth = np.radians(degrees)
         eye = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        far = np.inf if isinstance(view, str) and view != "normal" else 2.5 * np.linalg.norm(scene.high - scene.low)
-        return cls(np.array([right, np.cross(eye, right), eye]), (scene.low + scene.high) / 2, float(far))
+        return cls(np.array([right, np.cross(eye, right), eye]), middle, far)
 
     def __call__(self, points: Array) -> Array:
         """Return points (..., 3) on paper (..., 2)."""
         q = (points - self.middle) @ self.axes.T
-        return q[..., :2] / (1.0 - q[..., 2:] / self.distance)
+        depth = 1.0 - q[..., 2:] / self.distance
+        return q[..., :2] / np.where(depth > NEAREST, depth, np.nan)
+
+    def frame(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Return the corners (2,) on paper of the picture of a box; from inside of the box those of a window."""
+        edges = self(box_corners(low, high))
+        if np.isnan(edges).any():
+            return np.full(2, -WINDOW * self.distance), np.full(2, WINDOW * self.distance)
+        return edges.min(axis=0), edges.max(axis=0)
 
 
 def box_corners(low: Array, high: Array) -> Array:
@@ -318,26 +390,37 @@ def box_corners(low: Array, high: Array) -> Array:
 
 
 def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
-    """Draw a scene in perspective above a grid on the ground, with the shadows of paths and of few landmarks."""
-    axes.set_axis_off()
+    """Draw a scene in perspective above a grid on the ground, with the shadows of paths and of few landmarks.
+
+    Without perspective it has axes in metres.
+    """
+    flat = projection.distance == np.inf
     axes.set_aspect("equal", adjustable="box")
+    if flat:
+        style_axes(axes, *(f"{'xyz'[int(np.argmax(np.abs(axis)))]} (m)" for axis in projection.axes[:2]))
+    else:
+        axes.set_axis_off()
+        for points, style, *_ in [*_ground(axes, scene, projection), _shadows(scene)]:
+            axes.plot(*projection(points).T, clip_on=False, **style)
+    for points, style, label, _ in strokes(scene):
+        axes.plot(*projection(scene.inside(points)).T, clip_on=False, label=label or None, **style)
+    for name, point in _labels(scene):
+        u, v = projection(point)
+        axes.text(u, v + 0.012 * scene.size, name, **NAMED)
+    low, high = projection.frame(scene.low, scene.high)
+    pad = 0.0 if flat else 0.04 * (high - low).max()
+    axes.set_xlim(low[0] - pad, high[0] + pad)
+    axes.set_ylim(low[1] - pad, high[1] + pad)
+
+
+def _shadows(scene: Scene) -> Stroke:
+    """Return the paths on the ground, and lines from few landmarks down to it."""
     floor = scene.ground
     shadows = [np.column_stack([line[:, :2], np.full(len(line), floor)]) for line in map(scene.line, scene.paths)]
     if len(scene.ids) <= CROWD:
         standing = scene.shapes.means[scene.shapes.group != LINES]
         shadows += [np.array([point, [*point[:2], floor]]) for point in standing]
-    drawn = [Stroke(scene.inside(join_polylines(shadows)), {"color": SHADOW, "linewidth": 0.7, "zorder": 1})]
-    drawn += [Stroke(scene.inside(stroke.points), stroke.style) for stroke in strokes(scene)]
-    for points, style, *_ in _ground(axes, scene, projection) + drawn:
-        axes.plot(*projection(points).T, clip_on=False, **style)
-    for name, point in _labels(scene):
-        u, v = projection(point + np.array([0.0, 0.0, 0.012 * scene.size]))
-        axes.text(u, v, name, **NAMED)
-    edges = projection(box_corners(scene.low, scene.high))
-    low, high = edges.min(axis=0), edges.max(axis=0)
-    pad = 0.04 * (high - low).max()
-    axes.set_xlim(low[0] - pad, high[0] + pad)
-    axes.set_ylim(low[1] - pad, high[1] + pad)
+    return Stroke(scene.inside(join_polylines(shadows)), {"color": SHADOW, "linewidth": 0.7, "zorder": 1})
 
 
 def grid_spacing(size: float) -> float:

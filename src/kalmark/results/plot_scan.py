@@ -22,12 +22,19 @@ from kalmark.results.figure_texts import figure as figure_of
 from kalmark.results.history import Camera, Measuring
 from kalmark.results.plot_measured import draw_measured, sensors_with_picture
 from kalmark.results.recording import Recording
-from kalmark.results.scene import INK, Image, Sighting, clip_line, colour_of, contours, images, join_polylines, steps_of
+from kalmark.results.scene import (
+    INK,
+    OUTCOME_COLOURS,
+    Image,
+    Sighting,
+    clip_line,
+    colour_of,
+    contours,
+    images,
+    join_polylines,
+    steps_of,
+)
 
-OUTCOME = {
-    "associated": "#4a8f7b", "new": "#d2a23c", "rejected": "#c8553d", "ignored": "#8b929c",
-    "deferred": "#5b67a8", "tentative": "#9a62ab",
-}  # fmt: skip
 FAINT, ROBOT = "#c4c8cf", "#1f5fa8"
 PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
@@ -81,7 +88,7 @@ def _observations(axes: Axes, told: Explanation, low: Array, high: Array) -> Non
     for place in squares.values():
         axes.plot(*place, "s", color=INK, mfc="none", ms=8, zorder=4)
     for fate in fates:
-        colour, at = OUTCOME.get(fate.outcome, INK), fate.seen_at[:2]
+        colour, at = OUTCOME_COLOURS.get(fate.outcome, INK), fate.seen_at[:2]
         axes.plot(*at, "x", color=colour, ms=9, mew=2, zorder=5)
         labels.beside(at, _label(fate), fontsize=9, color=colour)
         for other in fate.near:
@@ -93,7 +100,7 @@ def _observations(axes: Axes, told: Explanation, low: Array, high: Array) -> Non
     for fate in fates:
         for other in fate.near:
             if other.landmark != fate.landmark:
-                style = {"fontsize": 8, "color": OUTCOME.get(fate.outcome, INK), **ON_LINE}
+                style = {"fontsize": 8, "color": OUTCOME_COLOURS.get(fate.outcome, INK), **ON_LINE}
                 labels.along(fate.seen_at[:2], other.place[:2], figure_of(other.d2), **style)
 
 
@@ -162,7 +169,7 @@ def _extent(told: Explanation) -> tuple[Array, Array]:
 def _legend(told: Explanation) -> list[Line2D]:
     outcomes = {f.outcome: ": d2" if ":" in _label(f) else "" for f in told.fates}
     mark: dict[str, Any] = {"ls": "", "marker": "x", "mew": 2}
-    marks = [Line2D([], [], **mark, color=OUTCOME.get(o, INK), label=f"{o}{d2}") for o, d2 in outcomes.items()]
+    marks = [Line2D([], [], **mark, color=OUTCOME_COLOURS.get(o, INK), label=f"{o}{d2}") for o, d2 in outcomes.items()]
     return [
         Line2D([], [], color=ROBOT, marker="o", label="robot after the scan, 3 sigma of the shape"),
         Line2D([], [], ls="", marker="s", color=INK, mfc="none", label="landmark compared with, d2"),

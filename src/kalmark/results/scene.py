@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
+from kalmark.picture_options import USUAL, Picture
 from kalmark.results.control_gaps import while_lost
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
 from kalmark.results.history import Camera, History, Ints, MapSnapshot, Measuring
@@ -46,15 +47,31 @@ POINTS = 2000  # of a curve
 CLEAR = 0.3  # a point whose sigma is a larger part of its distance does not widen the picture
 REACH, REACH_M = 0.15, 0.5  # a contour widens the picture by at most this part of it, or so much
 PAD, PAD_M = 0.04, 0.2  # around it, a part of its longest side, or so much
+OUTCOME_COLOURS = {
+    "associated": "#4a8f7b", "new": "#d2a23c", "rejected": "#c8553d", "ignored": "#8b929c",
+    "deferred": "#5b67a8", "tentative": "#9a62ab",
+}  # fmt: skip
 NARROW = 0.15  # the least width of a plan, as a part of its length
 FRAMES = 6  # cameras are drawn at so many poses of a path
 BODY = np.array([[1.0, 0, 0], [-0.6, 0.5, 0], [-0.6, -0.5, 0], [1.0, 0, 0], [-0.6, 0, 0.45], [-0.3, 0, 0]])  # a dart
 SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.5, -0.5, 0]])
 
 
+class Ray(NamedTuple):
+    """An observation of a scan: its outcome, and positions (d,) of the sensor, the observed point and the landmark.
+
+    `seen_at` is NaN of a sensor that does not measure all coordinates, `landmark` of an observation without one.
+    """
+
+    outcome: str
+    sensor: Array
+    seen_at: Array
+    landmark: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A run up to one of its steps, in the plane (d = 2) or in space (d = 3).
+    """A run up to one of its steps, or a filter now, in the plane (d = 2) or in space (d = 3).
 
     By robot: poses (N, 3|7) and the covariances (N, d, d) of their positions up to the step, `stretches` (S,), the gaps
     in time up to each of all its steps, `dotted` (S,), whether the way to each is unknown, positions by `dead`
@@ -66,7 +83,8 @@ class Scene:
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
     corners of the box to draw, the same for all steps.  Covariances are those of the shape (`kalmark.results.gauge`) or
     those in the `world`.  The truth is `aligned` by a rigid motion of the path where the frames differ, and
-    for the shape.
+    for the shape.  `true_ends` are the true poses (3|7,) of robots at the step, `rays` the observations of the last
+    scan, `picture` the options, and `end` is the text of the robots' last pose in a legend.
     """
 
     d: int
@@ -90,11 +108,16 @@ class Scene:
     known_ids: tuple[Id, ...]
     world: bool
     aligned: bool
+    true_ends: Mapping[str, Array] = field(default_factory=dict)
+    rays: tuple[Ray, ...] = ()
+    picture: Picture = USUAL
+    end: str = "end"
 
     @classmethod
     def of(cls, run: Recording, step: int | None = None, world: bool = False) -> Scene:
         """Return the scene of a run after a step, by default the last; the box is that of the whole run."""
-        history, d = run.history, run.history.d
+        history, d, picture = run.history, run.history.d, picture_of(run)
+        world = world or picture.ellipses == "world"
         known = np.isfinite(run.truth.poses).all(axis=1)
         aligned = bool(known.any()) and not (run.truth.frame == "truth" and (world or run.truth.anchored))
         to_map = run.truth.to_map()
@@ -120,9 +143,9 @@ class Scene:
         poses, P = history.poses, history.pose_covariances[:, :d, :d]
         P = P if world else history.robot_shape(np.arange(len(P)))
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
-        true = [l.reshape(-1, d) if len(l) == 2 * d else l[None, :d] for l in landmarks.values()]
         known_at = exact.positions()[0][:, :d]
-        low, high = _box(poses[:, :d], ends, whole, [*truth.values(), *used.values(), *true, known_at])
+        more = [*truth.values(), *used.values(), *places_of(landmarks, d), known_at]
+        low, high = drawn_box(poses[:, :d], ends, whole, more, picture)
         paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
         dead = {r: history.dead_reckoned[until][rows[until]][:, :d] for r, rows in mine.items()}
         stretches = {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()}
@@ -147,13 +170,23 @@ class Scene:
         return cls(
             d, paths, covariances, stretches, dotted, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
             join_polylines([line[:, :d] for line in twice], d), unseen, known_at, tuple(exact.ids),
-            world, aligned,
+            world, aligned, picture=picture,
         )  # fmt: skip
 
     @property
     def of_what(self) -> str:
         """The text of the ellipses in a legend."""
         return "in the world" if self.world else "of the shape"
+
+    def how_large(self, of: str = "") -> str:
+        """Return the text of the ellipses in a legend, "" without any."""
+        return "" if self.picture.ellipses == "off" else f", {self.picture.sigmas:g}σ{of} {self.of_what}"
+
+    def rings(self, means: Array, covariances: Array) -> Array:
+        """Return the contours of Gaussians as one polyline (N, d), NaN between them; none if they are not drawn."""
+        if self.picture.ellipses == "off":
+            return np.empty((0, self.d))
+        return join_polylines(np.concatenate(contours(means, covariances, self.picture.sigmas)), self.d)
 
     @property
     def how(self) -> str:
@@ -173,7 +206,7 @@ class Scene:
     def colour(self, robot: str) -> str:
         """Return the robot's colour."""
         colours = SPACE_COLOURS if self.d == 3 else COLOURS
-        return colours[list(self.paths).index(robot) % len(colours)]
+        return self.picture.colour(robot, colours[list(self.paths).index(robot) % len(colours)])
 
     def line(self, robot: str) -> Array:
         """Return a robot's path (N, d), NaN where its way is unknown."""
@@ -302,11 +335,31 @@ def _placed(pose: Array, points: Array) -> Array:
     return points @ matrix(np.ascontiguousarray(pose[3:7])).T + pose[:3]
 
 
-def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:
+def places_of(landmarks: Mapping[Id, Array], d: int) -> list[Array]:
+    """Return the points (N, d) of true landmarks, of lines both ends."""
+    return [l.reshape(-1, d) if len(l) == 2 * d else l[None, :d] for l in landmarks.values()]
+
+
+def picture_of(run: Recording) -> Picture:
+    """Return the options of drawings in the configuration of a run."""
+    given = run.config.get("picture") or {}
+    return Picture(**{key: value for key, value in given.items() if value is not None})
+
+
+def drawn_box(
+    path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array], picture: Picture
+) -> tuple[Array, Array]:
     """Return the corners (d,) of what is to be seen: a path, contours at its ends, landmarks whose place is clear.
 
-    Contours reach out of it where they are huge.
+    Contours reach out of it where they are huge.  Limits of the picture replace what they name.
     """
+    low, high = _box(path, ends, drawn, more)
+    given = np.reshape(picture.limits_m or (), (-1, 2))[: len(low)]
+    low[: len(given)], high[: len(given)] = given.T
+    return low, high
+
+
+def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:
     d = path.shape[1]
     means, covariances = drawn.means, drawn.covariances
     known = _known(means, covariances)

@@ -48,10 +48,8 @@ class Truth:
             mine = history.robot == robot
             if mine.any():
                 poses[mine] = poses_of_size(trajectory.at(history.t_ns[mine]), size)
-        offset = ORIGIN[size] if anchored else _offset(log.truth, _known(history, poses), size)
-        landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in log.landmarks.items()}
-        if size == 7:
-            landmarks = {i: np.append(l, 0.0) if len(l) == 2 else l for i, l in landmarks.items()}
+        offset = ORIGIN[size] if anchored else frame_offset(log.truth, _known(history, poses), size)
+        landmarks = landmarks_of_size(log.landmarks, size)
         return cls(poses, landmarks, dict(log.gps), offset, anchored, tuple(log.truth))
 
     def __bool__(self) -> bool:
@@ -119,6 +117,12 @@ def poses_of_size(poses: Array, size: int) -> Array:
     return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
 
 
+def landmarks_of_size(landmarks: Mapping[Id, Any], size: int) -> dict[Id, Array]:
+    """Return true landmarks as they are among robots of the plane (size 3), or of space (size 7: points at z = 0)."""
+    arrays = {i: np.asarray(l, dtype=np.float64) for i, l in landmarks.items()}
+    return {i: np.append(l, 0.0) if size == 7 and len(l) == 2 else l for i, l in arrays.items()}
+
+
 def as_rigid(pose: Array) -> Rigid:
     """Return the transform from the frame that a pose (3,) or (7,) is, to the frame that it is given in."""
     if len(pose) == 7:
@@ -152,7 +156,7 @@ def _known(history: History, poses: Array) -> list[RobotStart]:
     return first
 
 
-def _offset(trajectories: Mapping[str, Any], starts: Sequence[RobotStart], size: int) -> Array:
+def frame_offset(trajectories: Mapping[str, Any], starts: Sequence[RobotStart], size: int) -> Array:
     """Return the pose of the truth's frame in the map's: the origin if the first robot with truth started there."""
     for start in starts:
         if start.robot not in trajectories:

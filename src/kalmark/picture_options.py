@@ -1,0 +1,54 @@
+"""Picture: the options of all drawings of a map, as a section of a configuration and as arguments of `km.draw`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from kalmark.declare import Positive, Values, Within, refuse, register
+
+
+@register("picture", "picture")
+class Picture:
+    """Content and view of the drawings of a map: map.png, the page, videos, `km.draw` and `kalmark view`."""
+
+    view: Annotated[
+        Literal["normal", "top", "side", "front", "self", "orbit"] | tuple[float, float],
+        Within(),
+        "Of space: in perspective, from above, along y, along x, from behind the robot, turning in videos and on the "
+        "page; or [elevation, azimuth] of the eye, deg.",
+    ] = "normal"
+    limits_m: Annotated[
+        tuple[float, ...] | None,
+        Within(),
+        "Box to draw: [x_min, x_max, y_min, y_max], in space with z_min, z_max; all of the map if absent.",
+    ] = None
+    width_px: Annotated[Positive | None, "Width of the picture; by its content if absent."] = None
+    ellipses: Annotated[
+        Literal["shape", "world", "off"],
+        "Ellipses of the shape of the map, in the world with the start's uncertainty, or none.",
+    ] = "shape"
+    sigmas: Annotated[Positive, "Size of the ellipses."] = 3.0
+    labels: Annotated[bool | None, "Names at the landmarks; in space, of up to 40 of them, if absent."] = None
+    truth: Annotated[bool, "Draw the true robots, paths and landmarks, where they are known."] = True
+    sensors: Annotated[bool, "Draw the cameras of the robots, and the last scan."] = True
+    colours: Annotated[
+        Mapping[str, str] | None,
+        Values(),
+        "Colours, as matplotlib names them, of a robot by its name, and of `landmarks`, `others` (landmarks of space "
+        "that are not Euclidean), `lines` and `truth`.",
+    ] = None
+
+    def __post_init__(self) -> None:
+        limits = self.limits_m
+        if limits is not None and (
+            len(limits) not in (4, 6) or any(a >= b for a, b in zip(limits[::2], limits[1::2], strict=True))
+        ):
+            raise refuse(self, "limits_m", "4 or 6 numbers, each minimum below its maximum")
+
+    def colour(self, what: str, usual: str) -> str:
+        """Return the colour of a robot or of a kind of things, by default the usual one."""
+        return (self.colours or {}).get(what, usual)
+
+
+USUAL = Picture()

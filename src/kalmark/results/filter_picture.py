@@ -1,0 +1,186 @@
+"""`draw`: the picture of a filter now, for a program's own loop and for animations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.errors import KalmarkError, MapError
+from kalmark.events import Fix, Id, Scan, short_text
+from kalmark.logs.log import Log, begins_at
+from kalmark.picture_options import Picture
+from kalmark.report import Report
+from kalmark.results.filter_description import cameras, mount_now, observed_points
+from kalmark.results.history import RobotStart
+from kalmark.results.landmark_table import MapLandmarks, shapes
+from kalmark.results.scene import Ray, Scene, drawn_box, places_of
+from kalmark.results.truth import ORIGIN, as_rigid, frame_offset, landmarks_of_size, move_landmarks, poses_of_size
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from kalmark.slam.slam import Slam
+
+DRAWN = "kalmark"  # the gid of what `draw` has drawn on axes
+
+
+def draw(
+    slam: Slam,
+    ax: Axes | None = None,
+    truth: Any = None,
+    report: Report | Iterable[Report] = (),
+    path: Any = None,
+    **options: Any,
+) -> Axes:
+    """Draw robots and landmarks with the 3-sigma ellipses of their covariances, as they are now, and return the axes.
+
+    On axes that it drew on before, this replaces what it drew then; without `ax` it makes a figure.  `truth` are true
+    robots, now or up to now, and landmarks by their names, each an array (3,), (7,), (N, 3) or (N, 7) or a position, in
+    the frame of the map; of one robot its array alone; or a log, of which the poses up to the time of the filter are
+    drawn.  `report`, or several, are those of the last scans, whose observations are drawn in the colours of their
+    outcomes, from the sensor to where they seem to come from, and dotted from there to the landmark.  `path` are the
+    poses (N, 3|7) of a robot so far, by its name or of one robot alone.  Robots in space are seen in perspective, or as
+    `view` has it.  The other `options` are those of the section `picture` of a configuration.  `axes.legend()` adds a
+    legend.  Raises KalmarkError for a truth or a path of another shape.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover)
+    >>> report = slam.process(km.Scan(t_s=0.0, robot="rover", sensor="lidar", y=[[4.2, 0.3]], ids=[7]))
+    >>> axes = km.draw(slam, truth=[0.1, 0.0, 0.0], report=report, labels=True)
+    >>> [text.get_text() for text in axes.texts]
+    ['7']
+    """
+    from matplotlib.pyplot import subplots
+
+    from kalmark.results.plot import Projection, draw_plan, draw_space  # matplotlib is slow to import
+
+    picture = Picture(**{"ellipses": "world"} | options)
+    scene = scene_of_filter(slam, truth, [report] if isinstance(report, Report) else report, path, picture)
+    if ax is None:
+        ax = subplots(layout="constrained")[1]
+    for artist in [*ax.get_children()]:
+        if artist.get_gid() == DRAWN:
+            artist.remove()
+    others = {*ax.get_children()}
+    if scene.d == 2:
+        draw_plan(ax, scene)
+    else:
+        draw_space(ax, scene, Projection.of(scene))
+    for artist in ax.get_children():
+        if artist not in others:
+            artist.set_gid(DRAWN)
+    return ax
+
+
+def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any, picture: Picture) -> Scene:
+    """Return the scene of a filter now; the arguments are those of `draw`."""
+    world, names, whole = picture.ellipses != "shape", tuple(slam.robots), MapLandmarks.of(slam)
+    d = 3 if whole.in_space else 2
+    size = 3 if d == 2 else 7
+    exact = whole.split()[1]
+    if world:
+        robots = np.array([slam.covariance(name)[:d, :d] for name in names])
+    else:
+        whole, robots = whole.shape(slam, names)
+    mapped = whole.split()[0]
+    drawn, known = shapes(*mapped.places(), mapped.kinds, d), exact.positions()[0][:, :d]
+    poses = {name: slam.mean(name)[:size] for name in names}
+    before = _poses_by_robot(path, names, size, "path")
+    ways = {name: np.vstack([before.get(name, np.empty((0, size))), pose]) for name, pose in poses.items()}
+    true, landmarks = truth_until_now(slam, truth, size)
+    shown = [*(way[:, :d] for way in (*ways.values(), *true.values())), *places_of(landmarks, d), known]
+    ends = {name: (pose, P) for (name, pose), P in zip(poses.items(), robots, strict=True)}
+    low, high = drawn_box(np.empty((0, d)), ends, drawn, shown, picture)
+    most = max(map(len, (*ways.values(), *true.values())))
+    return Scene(
+        d=d,
+        paths=ways,
+        pose_covariances={name: P[None] for name, (_, P) in ends.items()},
+        stretches=dict.fromkeys(names, np.zeros(most, dtype=np.int64)),
+        dotted={name: np.zeros(len(way), dtype=np.bool_) for name, way in ways.items()},
+        dead={},
+        truth={name: way[:, :d] for name, way in true.items() if len(way) > 1},
+        fixes={},
+        used={},
+        true_landmarks=landmarks,
+        ids=tuple(mapped.ids),
+        shapes=drawn,
+        cameras=cameras(slam),
+        low=low,
+        high=high,
+        repeats=np.empty((0, d)),
+        unseen=np.array([mapped.means[mapped.ids.index(i)][:d] for i in mapped.unseen]).reshape(-1, d),
+        known=known,
+        known_ids=tuple(exact.ids),
+        world=world,
+        aligned=False,
+        true_ends={name: way[-1] for name, way in true.items()},
+        rays=tuple(ray for report in reports for ray in rays_of(slam, report)),
+        picture=picture,
+        end="robot",
+    )
+
+
+def rays_of(slam: Slam, report: Report) -> list[Ray]:
+    """Return the observations of the last scan of a filter, with the places of its robot and landmarks now."""
+    scan = report.event
+    if not isinstance(scan, Scan) or not len(report.y):
+        return []
+    pose, mount = slam.mean(scan.robot), slam.robots[scan.robot].sensors[scan.sensor]
+    d = slam.place(scan.robot)[0].size
+    at = mount_now(slam, scan.robot, scan.sensor, mount.at)
+    sensor = as_rigid(pose[: len(at)])(at[:d])
+    seen_at = observed_points(slam, scan.robot, scan.sensor, pose[: 3 if d == 2 else 7], report.y)
+    return [Ray(o.outcome, sensor, seen_at[o.index], _place(slam, o.landmark, d)) for o in report.observations]
+
+
+def _place(slam: Slam, name: Id | None, d: int) -> Array:
+    """Return the place (d,) of a landmark or a robot, NaN of one that is not in the map or has no position."""
+    try:
+        return slam.place(name)[0][:d]  # type: ignore[arg-type]
+    except MapError:
+        return np.full(d, np.nan)
+
+
+def _poses_by_robot(given: Any, names: tuple[str, ...], size: int, what: str) -> dict[str, Array]:
+    """Return poses (N, size), N > 0, by robot.  Raises KalmarkError."""
+    named = given if isinstance(given, Mapping) else {} if given is None else {names[0]: given}
+    try:
+        rows = {name: np.asarray(poses, dtype=np.float64) for name, poses in named.items() if np.size(poses)}
+        if not {*rows} <= {*names} or (rows and len(names) > 1 and named is not given):
+            raise ValueError
+        return {name: np.atleast_2d(poses)[:, np.arange(size)] for name, poses in rows.items()}
+    except (TypeError, ValueError, IndexError):
+        wanted = f"poses (N, {size}), of several robots by their names"
+        raise KalmarkError(f"draw: {what} is {short_text(given)}, expected {wanted}") from None
+
+
+def truth_until_now(slam: Slam, truth: Any, size: int) -> tuple[dict[str, Array], dict[Id, Array]]:
+    """Return the true poses (N, size) of robots up to now and the true landmarks, in the frame of the map."""
+    if isinstance(truth, Log):
+        return _logged_truth(slam, truth, size)
+    if not isinstance(truth, Mapping):
+        return _poses_by_robot(truth, tuple(slam.robots), size, "truth"), {}
+    landmarks = {i: np.asarray(l, dtype=np.float64) for i, l in truth.items() if i not in slam.robots}
+    robots = {i: poses for i, poses in truth.items() if i in slam.robots}
+    return _poses_by_robot(robots, tuple(slam.robots), size, "truth"), landmarks
+
+
+def _logged_truth(slam: Slam, log: Log, size: int) -> tuple[dict[str, Array], dict[Id, Array]]:
+    starts = []
+    for name, robot in slam.robots.items():
+        t_ns, dof = begins_at(log.events, name, robot.motion.held), robot.motion.space.dof
+        if t_ns is not None:
+            P = np.zeros((dof, dof)) if robot.cov is None else np.asarray(robot.cov)
+            starts.append(RobotStart(name, np.asarray(robot.start), P, t_ns))
+    anchored = len(slam.tracks.known) or any(type(event) is Fix for event in log.events)
+    to_map = as_rigid(ORIGIN[size] if anchored else frame_offset(log.truth, starts, size))
+    until, out = slam.t_ns or 0, {}
+    for name in log.truth.keys() & slam.robots.keys():
+        true = log.truth[name]
+        rows = np.vstack([true.poses[true.t_ns < until], true.at(np.array([until]))])
+        out[name] = to_map.poses(poses_of_size(rows, size))
+    return out, move_landmarks(to_map, landmarks_of_size(log.landmarks, size))

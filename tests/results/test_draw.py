@@ -1,0 +1,190 @@
+"""The picture of a filter now: what is drawn, where, and how large."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+
+import kalmark as km
+from kalmark.logs.log import Log, Trajectory
+from kalmark.report import Report
+from kalmark.results.scene import OUTCOME_COLOURS
+
+POSTS = {1: (4.0, 1.0), 2: (2.0, 3.0), 3: (-1.0, 2.0)}
+
+
+@pytest.fixture(autouse=True)
+def _close() -> Any:
+    yield
+    plt.close("all")
+
+
+def plane(mount: Any = (0.2, 0.0, 0.0), **options: Any) -> km.Slam:
+    lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1, sigma_bearing_rad=0.05), at=mount)
+    rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar}, cov=np.diag([0.01, 0.02, 0.001]))
+    return km.Slam(rover, estimator=km.estimators.Ekf(), **options)
+
+
+def scan(slam: km.Slam, t_s: float, off: float = 0.0) -> Report:
+    """Process a scan of the posts from where the robot believes to be; `off` is added to the range of the first."""
+    x, y, heading = slam.mean("rover")
+    at = np.array([x + 0.2 * np.cos(heading), y + 0.2 * np.sin(heading), heading])
+    seen = km.geometry.observe(at, np.array([*POSTS.values()]))[0]
+    seen[0, 0] += off
+    return slam.process(km.Scan(t_s=t_s, robot="rover", sensor="lidar", y=seen, ids=[*POSTS]))
+
+
+def line(axes: Axes, label: str) -> Any:
+    (found,) = [line for line in axes.lines if line.get_label() == label]
+    return found
+
+
+def texts(axes: Axes) -> list[str]:
+    return [text.get_text() for text in axes.texts]
+
+
+def test_an_ellipse_has_the_axes_and_the_place_of_its_covariance() -> None:
+    slam = plane()
+    scan(slam, 0.1)
+    axes = km.draw(slam, sigmas=2.0)
+    rings = line(axes, "estimated landmarks, 2σ in the world").get_xydata()
+    rings = np.split(rings, np.flatnonzero(np.isnan(rings[:, 0])))[:-1]
+    assert len(rings) == 3
+    for ring, name in zip(rings, POSTS, strict=True):
+        d = ring[np.isfinite(ring[:, 0])] - slam.mean(name)
+        radii = np.linalg.norm(d, axis=1)
+        sigmas = np.sqrt(np.linalg.eigvalsh(slam.covariance(name)))
+        assert radii.min() == pytest.approx(2.0 * sigmas[0], rel=0.02)
+        assert radii.max() == pytest.approx(2.0 * sigmas[1], rel=0.02)
+        assert np.allclose(np.einsum("ni,ij,nj->n", d, np.linalg.inv(slam.covariance(name)), d), 4.0)
+
+
+def test_robot_and_true_robot_are_at_their_present_places() -> None:
+    slam = plane()
+    slam.process(km.Control(t_s=0.0, robot="rover", u=(1.0, 0.5)))
+    scan(slam, 1.0)
+    axes = km.draw(slam, truth={"rover": [0.7, 0.1, 0.4], 1: (4.1, 1.2)}, path=[[0.0, 0.0, 0.0]])
+    assert np.allclose(line(axes, "robot").get_xydata(), [slam.mean("rover")[:2]])
+    assert np.allclose(line(axes, "true robot").get_xydata(), [[0.7, 0.1]])
+    assert np.allclose(line(axes, "true landmarks").get_xydata(), [[4.1, 1.2]])
+    assert np.allclose(line(axes, "estimated path").get_xydata(), [[0.0, 0.0], slam.mean("rover")[:2]])
+    heading = line(axes, "robot")._marker.get_user_transform().transform([1.0, 0.0])
+    assert np.arctan2(heading[1], heading[0]) == pytest.approx(slam.mean("rover")[2])
+
+
+def test_an_observation_has_the_colour_of_its_outcome_and_lies_where_it_was_measured() -> None:
+    slam = plane()
+    first = scan(slam, 0.1)
+    axes = km.draw(slam, report=first)
+    assert to_hex(line(axes, "observation: new").get_color()) == OUTCOME_COLOURS["new"]
+    before, report = slam.mean(1).copy(), scan(slam, 0.2, off=1.5)
+    assert [o.outcome for o in report.observations] == ["rejected", "associated", "associated"]
+    axes = km.draw(slam, axes, report=report)
+    beam = line(axes, "observation: rejected").get_xydata()
+    assert to_hex(line(axes, "observation: rejected").get_color()) == OUTCOME_COLOURS["rejected"]
+    x, y, heading = slam.mean("rover")
+    sensor = np.array([x + 0.2 * np.cos(heading), y + 0.2 * np.sin(heading)])
+    assert np.allclose(beam[0], sensor)
+    along = (before - sensor) / np.linalg.norm(before - sensor)
+    assert np.allclose(beam[1], before + 1.5 * along, atol=1e-6)
+    assert "observation: new" not in [each.get_label() for each in axes.lines]
+
+
+def test_a_bearing_is_a_line_to_its_landmark() -> None:
+    eye = km.Robot("rover", km.motion.Unicycle(), sensors={"eye": km.Mount(km.sensors.Bearing(), at=(0.1, 0.0, 0.0))})
+    slam = km.Slam(eye)
+    slam.add_landmark(1, POSTS[1], np.diag([0.1, 0.1]))
+    report = slam.process(km.Scan(t_s=0.0, robot="rover", sensor="eye", y=[[np.arctan2(1.0, 3.9)]], ids=[1]))
+    beam = line(km.draw(slam, report=report), "observation: associated").get_xydata()
+    assert np.allclose(beam[:2], [[0.1, 0.0], slam.mean(1)])
+
+
+def test_a_second_picture_replaces_the_first_and_nothing_else() -> None:
+    slam = plane()
+    scan(slam, 0.1)
+    _, axes = plt.subplots()
+    axes.plot([0, 1], [0, 1], label="mine")
+    km.draw(slam, axes, labels=True)
+    count = len(axes.get_children())
+    assert texts(axes) == ["1", "2", "3"]
+    for k in range(3):
+        scan(slam, 0.2 + k)
+        assert km.draw(slam, axes, labels=True) is axes
+    assert len(axes.get_children()) == count
+    assert line(axes, "mine").get_xydata().tolist() == [[0, 0], [1, 1]]
+
+
+def test_options_change_what_is_drawn() -> None:
+    slam = plane()
+    report = scan(slam, 0.1)
+    options: dict[str, Any] = {"ellipses": "off", "sensors": False, "colours": {"landmarks": "#123456"}}
+    axes = km.draw(slam, None, {"rover": np.zeros(3), **POSTS}, report, limits_m=[-2, 5, -1, 4], **options)
+    labels = [each.get_label() for each in axes.lines if not each.get_label().startswith("_")]
+    assert labels == ["estimated path", "true robot", "true landmarks", "estimated landmarks", "robot"]
+    assert line(axes, "estimated landmarks").get_color() == "#123456"
+    assert (*axes.get_xlim(), *axes.get_ylim()) == (-2, 5, -1, 4)
+    world, shape = (km.draw(slam, ellipses=each) for each in ("world", "shape"))
+    rings = line(world, "estimated landmarks, 3σ in the world"), line(shape, "estimated landmarks, 3σ of the shape")
+    spans = [np.nanmax(ring.get_xdata()) - np.nanmin(ring.get_xdata()) for ring in rings]
+    assert spans[1] < spans[0]  # without the start's uncertainty
+
+
+def test_a_log_gives_the_truth_up_to_the_present_time_in_the_frame_of_the_map() -> None:
+    slam = plane()
+    t_ns = np.array([0, 1, 2]) * 10**9
+    drive = [km.Control(t_s=float(k), robot="rover", u=(1.0, 0.0)) for k in range(3)]
+    # the true start is at (5, 5), heading along y; the filter starts at the origin, which is the map's
+    poses = np.array([[5.0, 5.0, np.pi / 2], [5.0, 6.0, np.pi / 2], [5.0, 7.0, np.pi / 2]])
+    log = Log("", ("rover",), drive, truth={"rover": Trajectory(t_ns, poses)}, landmarks={9: np.array([4.0, 9.0])})
+    for event in drive[:2]:
+        slam.process(event)
+    axes = km.draw(slam, truth=log)
+    assert np.allclose(line(axes, "true robot").get_xydata(), [[1.0, 0.0]])
+    assert np.allclose(line(axes, "true path").get_xydata(), [[0.0, 0.0], [1.0, 0.0]])
+    assert np.allclose(line(axes, "true landmarks").get_xydata(), [[4.0, 1.0]])
+
+
+@pytest.mark.parametrize(("view", "columns"), [("top", [0, 1]), ("side", [0, 2]), ("front", [1, 2])])
+def test_robots_in_space_are_projected(view: str, columns: list[int]) -> None:
+    at = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    eye = km.Mount(km.sensors.Position3D())
+    slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), start=at, sensors={"eye": eye}, cov=0.01 * np.eye(6)))
+    y = [[2.0, 1.0, 0.5], [3.0, -2.0, 1.5]]
+    report = slam.process(km.Scan(t_s=0.0, robot="drone", sensor="eye", y=y, ids=[1, 2]))
+    axes = km.draw(slam, report=report, truth=[0.1, 0.2, 1.1, 0, 0, 0, 1], view=view)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == tuple(f"{'xyz'[k]} (m)" for k in columns)
+    assert np.allclose(line(axes, "robot").get_xydata(), [np.array(at[:3])[columns]])
+    assert np.allclose(line(axes, "true robot").get_xydata(), [np.array([0.1, 0.2, 1.1])[columns]])
+    beams = line(axes, "observation: new").get_xydata()
+    assert np.allclose(beams[[1, 4]], np.add(y, [0, 0, 1.0])[:, columns])
+    assert texts(axes) == ["1", "2"]
+
+
+def test_the_view_from_behind_the_robot_has_ahead_what_it_looks_at() -> None:
+    turned = (0.0, 0.0, 1.0, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))  # its x points along y
+    eye = km.Mount(km.sensors.Position3D())
+    slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), start=turned, sensors={"eye": eye}))
+    for name, place in {"ahead": (0.0, 6.0, 1.0), "left": (-2.0, 4.0, 1.0), "behind": (0.0, -9.0, 1.0)}.items():
+        slam.add_landmark(name, place, 0.01 * np.eye(3))
+    axes = km.draw(slam, view="self", ellipses="off", labels=True)
+    at = dict(zip(texts(axes), (text.get_position() for text in axes.texts), strict=True))
+    assert abs(at["ahead"][0]) < 1e-9
+    assert at["ahead"][1] > 0
+    assert at["left"][0] < 0
+    assert np.isnan(at["behind"][0])
+
+
+def test_a_path_or_a_truth_of_another_shape_is_refused_in_one_line() -> None:
+    slam = plane()
+    for key in ("truth", "path"):
+        with pytest.raises(km.KalmarkError, match=rf"draw: {key} is .*, expected poses \(N, 3\)"):
+            km.draw(slam, **{key: [1.0, 2.0]})
+    with pytest.raises(km.KalmarkError, match=r"limits_m is .*, expected 4 or 6 numbers"):
+        km.draw(slam, limits_m=[1, 0, 0, 1])
+    with pytest.raises(km.KalmarkError, match="view is 'below', expected"):
+        km.draw(slam, view="below")
