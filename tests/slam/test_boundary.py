@@ -275,6 +275,12 @@ def test_a_scan_that_saw_nothing_has_no_rows() -> None:
             assert pickle.loads(pickle.dumps(event)).width == event.width
 
 
+def test_a_noise_of_whole_numbers_is_one_of_floats() -> None:
+    for sensor in (km.sensors.PinHole(sigma_px=5), km.sensors.Segments(sigma_px=2)):
+        y = 100.0 + np.arange(len(sensor.columns))
+        assert measurements(scan([y]), sensor).dtype == np.float64
+
+
 def test_what_only_looks_empty_is_refused() -> None:
     for y in ([[], []], [[]], np.zeros((0, 2, 2)), np.zeros((2, 0))):
         assert "expected (K, m): one row an observation" in refusal(lambda: scan(y), EventError)

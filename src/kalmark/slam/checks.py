@@ -172,7 +172,7 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
         return np.zeros((0, m, m))
     what, p = f"{label_of_event(event)}: cov", innovation_size(sensor)
     if event.cov is None:
-        R = sensor.noise(event.y)
+        R = np.asarray(sensor.noise(event.y), np.float64)  # one of whole numbers would be compiled for, too
         if np.shape(R) != (count, p, p) and not isinstance(sensor, OwnNoise):
             wrong = f"noise of {count} measurements has shape {np.shape(R)}, expected ({count}, {p}, {p})"
             raise EventError(f"{label_of_event(event)}: {event.robot}.{event.sensor}, {type(sensor).__name__}: {wrong}")
