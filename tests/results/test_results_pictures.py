@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -126,6 +128,36 @@ def test_the_report_is_one_file_that_asks_nothing_of_the_network(run: Run) -> No
     assert "http" not in markup
     assert not re.search(r"<(link|img|iframe)\b|\bsrc=", markup)
     assert len(page) < 8e6
+
+
+STEPPED = """<script>
+addEventListener("load", () => setTimeout(() => {
+  const shown = [], key = name => document.dispatchEvent(new KeyboardEvent("keydown", {key: name}));
+  const robot = () => el("map").data.find(trace => trace.name === "estimated path").x.filter(x => x !== null).length;
+  const note = () => shown.push([el("now").textContent, robot()]);
+  const bar = document.querySelector(".slider").getBoundingClientRect();
+  note();
+  const left = () => key("ArrowLeft"), right = () => key("ArrowRight");
+  for (const step of [left, () => el("back").click(), () => el("next").click(), right]) { step(); note(); }
+  document.title = JSON.stringify({shown, inSight: bar.top > 0 && bar.bottom <= innerHeight});
+}, 1000));
+</script></body>"""
+
+
+def test_the_page_goes_step_by_step_with_its_slider_in_sight(run: Run, tmp_path: Path) -> None:
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no chromium to open the page with")
+    (tmp_path / "page.html").write_text(report_html(run).replace("</body>", STEPPED))
+    options = ["--headless", "--no-sandbox", "--window-size=1280,800", "--virtual-time-budget=8000", "--dump-dom"]
+    command = [chromium, *options, f"file://{tmp_path}/page.html"]
+    page = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False).stdout
+    said = json.loads(re.search(r"<title>({.*?})</title>", page)[1])
+    assert said["inSight"]
+    count, times = len(run.history.t_ns), run.history.t_s
+    for (text, points), step in zip(said["shown"], (count, count - 1, count - 2, count - 1, count), strict=True):
+        assert text.startswith(f"step {step} of {count} · {times[step - 1]:.2f} s")
+        assert points == step
 
 
 def test_the_page_names_figures_in_the_words_of_the_command_line(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

@@ -71,8 +71,8 @@ _ROBOT = (
     ("diverged", "diverged", ""),
 )
 _HINTS = {
-    False: "3-sigma ellipses {}; drag the slider through time",
-    True: "3-sigma ellipsoids {}; drag to turn, scroll to come closer, drag the slider through time",
+    False: "3-sigma ellipses {}; arrow keys: single steps",
+    True: "3-sigma ellipsoids {}; drag to turn, scroll to come closer, arrow keys: single steps",
 }
 
 

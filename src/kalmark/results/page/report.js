@@ -86,14 +86,24 @@ window.addEventListener("beforeprint", () => [...waiting.keys()].forEach(drawNow
 function drawMap() {
   if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
   const slider = el("time"), draw = mapPicture(), mapped = DATA.maps.some(map => map.count);
-  const show = () => {
-    const map = DATA.maps[+slider.value];
-    el("now").textContent = `${map.t.toFixed(1)} s` + (mapped ? ` · ${map.count} landmarks` : "");
-    draw(+slider.value);
+  const steps = [...new Set(DATA.robots.flatMap(r => r.t))].sort((a, b) => a - b), pace = Math.ceil(steps.length / 120);
+  const show = () => {  /* the robots at a step, and the map that was kept last until then */
+    const now = steps[+slider.value], kept = Math.max(0, upTo(DATA.maps.map(map => map.t - 5e-4), now) - 1);
+    el("now").textContent = `step ${+slider.value + 1} of ${steps.length} · ${now.toFixed(2)} s` + (mapped ? ` · ${DATA.maps[kept].count} landmarks` : "");
+    draw(kept, now);
   };
-  slider.max = DATA.maps.length - 1;
+  const move = by => { slider.value = +slider.value + by; show(); };
+  slider.max = steps.length - 1;
   slider.value = slider.max;
   slider.addEventListener("input", show);
+  el("back").addEventListener("click", () => move(-1));
+  el("next").addEventListener("click", () => move(1));
+  document.addEventListener("keydown", event => {
+    const by = {ArrowLeft: -1, ArrowRight: 1}[event.key];
+    if (!by || event.ctrlKey || event.altKey || event.metaKey || event.target.tagName === "SELECT") return;
+    event.preventDefault();
+    move(by);
+  });
   let timer = null;
   el("play").addEventListener("click", () => {
     if (timer !== null) { clearInterval(timer); timer = null; el("play").textContent = "Play"; return; }
@@ -101,8 +111,7 @@ function drawMap() {
     el("play").textContent = "Pause";
     timer = setInterval(() => {
       if (+slider.value >= +slider.max) { el("play").click(); return; }
-      slider.value = +slider.value + 1;
-      show();
+      move(pace);
     }, 120);
   });
   show();

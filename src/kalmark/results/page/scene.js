@@ -115,9 +115,9 @@ function dart(r, at) {
   return {x: points.map(p => p[0]), y: points.map(p => p[1])};
 }
 
-/* The map and the robots at a position of the slider. */
-function moving(frame) {
-  const map = DATA.maps[frame], traces = [], many = map.count > 100, corners = !SPACE || !many ? 24 : map.count > 1000 ? 4 : 8;
+/* A map that was kept, and the robots at a time. */
+function moving(map, now) {
+  const traces = [], many = map.count > 100, corners = !SPACE || !many ? 24 : map.count > 1000 ? 4 : 8;
   GROUPS.forEach(([color, name], group) => {
     const rows = map.group.flatMap((g, i) => SPACE && g !== group ? [] : [i]), pick = k => rows.map(i => map[k][i]);
     const sigma = rows.map(i => map.pxx[i] === null ? null : Math.sqrt(Math.max(AXES.reduce((sum, k) => sum + map["p" + k + k][i], 0), 0)));
@@ -130,7 +130,7 @@ function moving(frame) {
   traces.push(stroke(boxed(map.lines), LINE, SPACE ? 1.6 : 2.2, quiet));
   if (SPACE) traces.push(stroke(map.tags, TAG, 1.2, quiet));
   DATA.robots.forEach((r, i) => {
-    const n = upTo(r.t, map.t), name = DATA.robots.length > 1 ? r.name : "estimated path", at = n ? [n - 1] : [];
+    const n = upTo(r.t, now), name = DATA.robots.length > 1 ? r.name : "estimated path", at = n ? [n - 1] : [];
     const own = {legendgroup: r.name, ...quiet};
     traces.push(stroke(pathOf(r, n, AXES), r.colour, 1.6, {name, legendgroup: r.name}));
     const dotted = stroke(bridgesOf(r, n, AXES), r.colour, 1.6, own);
@@ -146,7 +146,8 @@ function moving(frame) {
 
 function planarPage() {
   const [x, y] = [0, 1].map(a => [DATA.box.low[a], DATA.box.high[a]]), width = el("map").clientWidth || 1080;
-  const height = Math.min(820, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 120));
+  const most = Math.min(820, Math.max(480, innerHeight - 130));  /* with the slider on one screen */
+  const height = Math.min(most, Math.max(360, (width - 80) * (y[1] - y[0]) / (x[1] - x[0]) + 120));
   return layout({height, uirevision: "map", xaxis: {...axis("x (m)"), range: x},
                  yaxis: {...axis("y (m)"), range: y, scaleanchor: "x"}, margin: {l: 64, r: 16, t: 32, b: 44},
                  legend: {orientation: "h", y: -48 / (height - 100), yanchor: "top"}});
@@ -162,17 +163,17 @@ function spatialPage() {
             camera: {center: {x: 0, y: 0, z: -0.18}, eye: {x: 0.95, y: -1.4, z: 0.9}, up: {x: 0, y: 0, z: 1}}, dragmode: "turntable"}});
 }
 
-/* The picture of a map: a function that draws it, and the images if they are in view, at a position of the slider. */
+/* The picture of a map: a function that draws the map of a number and the robots at a time, and images if they are in view. */
 function mapPicture() {
   const background = still(), page = SPACE ? spatialPage() : planarPage();
-  let now = 0;
-  const images = () => DATA.cameras.forEach((camera, i) => drawImages(camera, i, now));
+  let shownMap = 0;
+  const images = () => DATA.cameras.forEach((camera, i) => drawImages(camera, i, shownMap));
   if (DATA.cameras.length) inView("images", images);
-  return frame => {
-    now = frame;
+  return (kept, now) => {
+    shownMap = kept;
     const shown = el("map")._fullLayout?.scene?._scene;  /* the slider must not turn the view back */
     if (shown) page.scene.camera = shown.getCamera();
-    Plotly.react("map", [...background, ...moving(frame)], page, CONFIG);
+    Plotly.react("map", [...background, ...moving(DATA.maps[kept], now)], page, CONFIG);
     if (!waiting.has(el("images"))) images();
   };
 }
