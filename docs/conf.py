@@ -78,6 +78,8 @@ html_theme_options = {
     "show_prev_next": True,
     "footer_start": ["copyright"],
     "footer_end": [],
+    # A lesson has no contents beside it: its code has their width, and lines of 96 characters do not scroll
+    "secondary_sidebar_items": {pages: ["page-toc"] for pages in ("*", "api/*", "project/*", "lessons/*")},
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }

@@ -11,6 +11,7 @@ import api_pages
 import course_pages
 import pytest
 
+import kalmark
 from kalmark.cli.app import app
 from test_docs import LESSONS, ROOT, anchors
 
@@ -74,3 +75,12 @@ def test_each_lesson_is_a_page_of_the_table() -> None:
 def test_every_number_of_a_document_is_in_the_table(seed: str, kind: str, last: int) -> None:
     numbers = {number for each in ITEMS if each.seed == seed for number in each.numbers[kind]}
     assert numbers == set(range(1, last + 1))
+
+
+def test_a_key_beside_a_setting_of_the_toolbox_is_one_of_kalmark() -> None:
+    known = "".join((DOCS / page).read_text() for page in ("configuration.md", "worlds.md", "datasets.md"))
+    known += " ".join(dir(kalmark.Slam))
+    for each in course_pages.options((DOCS / "toolbox.md").read_text()):
+        for code in re.findall(r"`([^`]+)`", each.item):
+            for key in re.findall(r"\b[a-z][a-z0-9]*(?:_[a-z0-9]+)+\b|[a-z]+(?=:)", code):
+                assert key in known, f"{each.place}: {key}"

@@ -24,7 +24,7 @@ def link(app: Any, name: str, source: list[str]) -> None:
     source[0] = source[0].replace("](course/items.csv)", "](lessons/items.md)")
     source[0] = re.sub(r"\]\(course/(\w+)/\)", r"](lessons/\1/index.rst)", source[0])
     for programs, shown in (("tutorials", "how"), ("course", "lessons")):
-        source[0] = re.sub(rf"\]\({programs}/([\w/]+)\.py\)", rf"]({shown}/\1.rst)", source[0])
+        source[0] = re.sub(rf"\]\((\.\./)?{programs}/([\w/]+)\.py\)", rf"](\1{shown}/\2.rst)", source[0])
 
 
 def setup(app: Any) -> dict[str, bool]:

@@ -26,7 +26,10 @@ file.write_text("0.0,0.5,0.1\n0.5,7,4.2,0.3\n1.0,0.5,0.1\n1.5,7,3.8,0.2\n")
 # The reader
 # ----------
 #
-# ``request`` has what the user asked for (times, robots, what is done about a bad row).
+# ``find`` returns the path that ``read`` takes, or None for what is not such a log. ``request`` has what the user asked
+# for (times, robots, what is done about a bad row). Further parameters of ``read`` are the options of the format: with
+# ``step_s: Annotated[Positive, "Time of a step."] = 1.0`` (``Positive`` of ``kalmark.declare``),
+# ``km.open_log("day.walk", step_s=2)`` and ``log: {path: day.walk, step_s: 2}`` check the value by its annotation.
 def find(path):
     return path if path.suffix == ".walk" else None
 

@@ -21,9 +21,7 @@ log = simulate(world, seed=1)
 # Nearest neighbour and the automatic choice
 # ------------------------------------------
 #
-# ``nearest`` takes the landmark at the least Mahalanobis distance. ``auto`` matches a scan as a whole, closes loops
-# and defers what is ambiguous; an observation confirms a landmark only with others (:doc:`/association`). In a
-# configuration: ``association: {type: auto}``.
+# Two of the methods of :doc:`/association`. In a configuration: ``association: {type: auto}``.
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained", sharex=True, sharey=True)
 choices = {"nearest": km.association.NearestNeighbour(), "auto": km.association.Automatic()}
 for ax, (name, association) in zip(axes, choices.items(), strict=True):

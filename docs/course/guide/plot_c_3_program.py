@@ -45,7 +45,7 @@ print(f"{len(known)} landmarks, error of the pose {(slam.x[:3] - R).round(3)}")
 # Red is the simulated world and robot, blue the estimated robot with its ellipse in magenta, green are the ellipses
 # of the landmarks, all at three sigmas, with 16 points each as in ``cov2elli``. Landmarks far from the start have
 # long ellipses: the error of the heading moves them.
-figure, ax = plt.subplots(figsize=(5, 5), layout="constrained")
+figure, ax = plt.subplots(figsize=(5, 5))
 
 
 def draw(step):
