@@ -108,7 +108,7 @@ def test_an_override_replaces_one_value_and_leaves_its_neighbours(good: Path) ->
         ("robots.each.start.x_m=.inf", "robots.each.start.x_m: got inf, expected a finite number"),
         (
             "robots.each.sensors.camera.detector=x",
-            "sensors.camera.detector: got 'x', expected a mapping with a type: one of corners, ",
+            "sensors.camera.detector: got 'x', expected one of corners, ",
         ),
         ("robots.each.sensors.camera.type=sonar", "robots.each.sensors.camera.type: got 'sonar', expected one of "),
         ("robots.each.sensors=[1]", "robots.each.sensors: got [1], expected a mapping of keys"),

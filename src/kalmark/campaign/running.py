@@ -24,11 +24,11 @@ from kalmark.campaign.finished_runs import Kept, cell_digest
 from kalmark.campaign.replay import Replay
 from kalmark.campaign.scoring import Scores, score
 from kalmark.campaign.sweep import Sweep
-from kalmark.campaign.sweep_cells import Cell, Scene, open_scene
+from kalmark.campaign.sweep_cells import Cell, Scene, open_scene, parse_estimator, refuse_unknown
 from kalmark.config.building import build_slam
 from kalmark.config.reading import did_you_mean, validate
 from kalmark.config.schema import Config
-from kalmark.config.tree import Tree
+from kalmark.config.tree import Tree, parse_value
 from kalmark.errors import ConfigError, KalmarkError
 from kalmark.logs.progress import track
 from kalmark.simulate.robots import simulation
@@ -45,7 +45,6 @@ ROUND = 4  # groups of runs a worker in one round, where results come in rounds
 BATCHED, FEW = "batched engine", "ordinary path: so few steps are done before the batched engine is compiled"
 WORTH = 200_000  # steps of a campaign from which the engine saves more than it takes to compile
 AT_ONCE = 20_000  # steps of the runs that the engine does in one group
-ESTIMATORS = ("invariant", "ekf", "fej")
 
 
 @dataclass(frozen=True)
@@ -125,8 +124,7 @@ def run_campaign(
     `address` is that of a dask or ray cluster.  Finished runs are kept in `folder`, if given, and are not run again
     unless `resume` is False.  Raises ConfigError, LogError or KalmarkError on anything that cannot be run.
     """
-    refuse_unknown(estimators)
-    scene = world if isinstance(world, World | Replay) else open_scene(world, progress=progress)
+    scene = world if isinstance(world, World | Replay) else open_scene(world, progress=progress, estimators=estimators)
     sweep = run_sweep(
         [Cell({}, scene)], runs, estimators, seed, jobs, backend, progress, map_every, skip, address, folder, resume
     )
@@ -187,19 +185,6 @@ def _campaign_of(plan: Plan, scores: dict[str, tuple[Scores, ...]], runs: int, s
     )
 
 
-def refuse_unknown(estimators: Sequence[str] | None) -> None:
-    """Refuse estimators that there are not, or that are given twice, before anything is simulated."""
-    if estimators is not None and not estimators:
-        raise ConfigError(f"campaign: got no estimator, expected one of {', '.join(ESTIMATORS)}")
-    for i, label in enumerate(estimators or ()):
-        name = label.partition(":")[0]
-        if name not in ESTIMATORS:
-            expected = f"expected one of {', '.join(ESTIMATORS)}{did_you_mean(name, ESTIMATORS)}"
-            raise ConfigError(f"campaign: estimator is {label!r}, {expected}")
-        if label in (estimators or ())[:i]:
-            raise ConfigError(f"campaign: estimator {label!r} is given twice, expected each once")
-
-
 def configs_of(world: Scene, estimators: Sequence[str] | None) -> dict[str, Config]:
     """Return the configuration of each estimator, by its label; the world's own keeps the world's keys.
 
@@ -211,11 +196,10 @@ def configs_of(world: Scene, estimators: Sequence[str] | None) -> dict[str, Conf
     refuse_unknown(estimators)
     configs = {}
     for label in estimators:
-        name, _, keys = label.partition(":")
+        name, keys = parse_estimator(label)
         same = name == base.estimator.type
         section: dict[str, Any] = base.estimator.model_dump() if same else {"type": name}
-        for key, _, value in (pair.partition("=") for pair in keys.split(",") if pair):
-            section[key.strip()] = int(value) if value.strip().isdecimal() else value
+        section |= {key: parse_value(value, f"estimator {label}") for key, value in keys.items()}
         tree = Tree(values={"estimator": section}, places={(): f"estimator {label}"})
         configs[label] = base.model_copy(update={"estimator": validate(tree, Config).estimator})
     return configs

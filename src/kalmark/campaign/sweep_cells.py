@@ -11,8 +11,9 @@ from typing import Any
 
 from kalmark.campaign.replay import Replay, replay_of
 from kalmark.config.opening import open_run
-from kalmark.config.reading import resolve_config, resolve_name, shipped_configs
+from kalmark.config.reading import did_you_mean, resolve_config, resolve_name, shipped_configs
 from kalmark.config.schema import Config
+from kalmark.config.sections import Choice
 from kalmark.config.tree import OVERRIDE, parse_value, read_tree
 from kalmark.errors import ConfigError
 from kalmark.logs.log import Log
@@ -40,13 +41,15 @@ def value_as_yaml(value: Any) -> str:
 
 
 def open_scene(
-    path_or_name: str | Path, overrides: Sequence[str] = (), log: str | Path | None = None, progress: bool = True
-) -> Scene:
+    path_or_name: str | Path, overrides: Sequence[str] = (), log: str | Path | None = None, progress: bool = True,
+    estimators: Sequence[str] | None = None,
+) -> Scene:  # fmt: skip
     """Return the world, or the replay of the configuration, at a path or of a shipped name; of both, the world.
 
     `log` is the log to use instead of the configuration's.  Raises ConfigError, LogError, KalmarkError.
     """
     found = _found(path_or_name, overrides, log)
+    refuse_unknown(estimators)
     return found if isinstance(found, World) else replay_of(*found, progress)
 
 
@@ -56,6 +59,7 @@ def open_cells(
     overrides: Sequence[str] = (),
     log: str | Path | None = None,
     progress: bool = True,
+    estimators: Sequence[str] | None = None,
 ) -> list[Cell]:
     """Return a cell for each combination of swept values, the last key's changing fastest; one without a sweep.
 
@@ -79,8 +83,34 @@ def open_cells(
             for override in told:
                 message = message.replace(f"{OVERRIDE}{override}", f"--sweep {override}")
             raise ConfigError(message) from None
+    refuse_unknown(estimators)
     scenes = [one if isinstance(one, World) else replay_of(*one, progress) for one in found]
     return [Cell(settings, scene) for settings, scene in zip(combinations, scenes, strict=True)]
+
+
+def parse_estimator(label: str) -> tuple[str, dict[str, str]]:
+    """Return the name of an estimator and the values of its keys: name, file:Class or name:key=value,key=value.
+
+    >>> parse_estimator("invariant:iterations=1"), parse_estimator("mine:Textbook")
+    (('invariant', {'iterations': '1'}), ('mine:Textbook', {}))
+    """
+    name, _, keys = label.rpartition(":") if "=" in label else (label, "", "")
+    pairs = (pair.partition("=") for pair in keys.split(",") if pair)
+    return name, {key.strip(): value.strip() for key, _, value in pairs}
+
+
+def refuse_unknown(estimators: Sequence[str] | None) -> None:
+    """Refuse estimators that there are not, or that are given twice, before anything is simulated."""
+    known = Choice("estimator")
+    if estimators is not None and not estimators:
+        raise ConfigError(f"campaign: got no estimator, expected one of {', '.join(known.names())}")
+    for i, label in enumerate(estimators or ()):
+        name, _ = parse_estimator(label)
+        if not known.has(name):
+            expected = f"expected one of {', '.join(known.names())}{did_you_mean(name, known.names())}"
+            raise ConfigError(f"campaign: estimator is {label!r}, {expected}")
+        if label in (estimators or ())[:i]:
+            raise ConfigError(f"campaign: estimator {label!r} is given twice, expected each once")
 
 
 def parse_sweep(text: str) -> tuple[str, list[Any]]:

@@ -38,7 +38,9 @@ def campaign(
     runs: Annotated[int, typer.Option(min=1, help="How many runs of each estimator.")],
     estimator: Annotated[
         list[str] | None,
-        typer.Option(help="invariant, ekf, fej, invariant:iterations=1; may be given again. (default: the file's)"),
+        typer.Option(
+            help="ekf, textbook, invariant:iterations=1, own_file:Class; may be given again. (default: the file's)"
+        ),
     ] = None,
     log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the campaign.")] = 0,
@@ -64,13 +66,12 @@ def campaign(
     """
     announce_compilation_elsewhere()
     from kalmark.campaign import open_cells, run_sweep
-    from kalmark.campaign.running import check_backend, refuse_unknown
+    from kalmark.campaign.running import check_backend
 
     out = writable(out or Path("out") / f"campaign-{Path(world).stem}")
-    refuse_unknown(estimator)
     check_backend(backend.value, address)
     with limit_blas_threads():
-        cells = open_cells(world, sweep or (), overrides or (), log)
+        cells = open_cells(world, sweep or (), overrides or (), log, estimators=estimator)
     result = run_sweep(
         cells, runs, estimator, seed, jobs, backend.value, skip=skip, address=address, folder=out, resume=resume
     )

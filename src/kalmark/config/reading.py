@@ -141,8 +141,8 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
         return ConfigError(f"{tree.place(path, of_key=True)}: {'.'.join(path)}: {message}")
     value = _at(tree.values, path)
     if kind == "union_tag_invalid":
-        path = (*path, "type")
-        message = _not_one_of(value.get("type"), context["types"], path) + context["missing"]
+        path, got = (path, value) if isinstance(value, str) else ((*path, "type"), value.get("type"))
+        message = _not_one_of(got, context["types"], path) + context["missing"]
     elif kind == "literal_error":
         message = _not_one_of(value, re.findall(r"'([^']+)'", context["expected"]), path)
     elif kind == "union_tag_not_found":

@@ -169,6 +169,8 @@ class Choice:
             return value
         if not self.typed:
             return self.made(self.role, value)
+        if isinstance(value, str):
+            value = {"type": value}
         name: Any = value.get("type", self.default) if isinstance(value, dict) else None
         if isinstance(name, str) and self.has(name):
             return self.made(name, value)
@@ -277,7 +279,10 @@ def model_of(section: Any, world: str = "plane") -> Any:
     model = class_of(section.of_role, section.of_name, section.of_world or world)
     given = {own.name: getattr(section, own.name) for own in parameters(model)}
     optional = {own.name for own in parameters(model) if own.optional and own.name in section.model_fields_set}
-    return model(**{name: value for name, value in given.items() if value is not None or name in optional})
+    try:
+        return model(**{name: value for name, value in given.items() if value is not None or name in optional})
+    except TypeError as error:
+        raise ModelError(f"{section.of_name} cannot be made of the keys of its section: {error}") from None
 
 
 def _unpickled(role: str, name: str, world: str, plugin: Path | None) -> Section:

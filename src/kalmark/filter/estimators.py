@@ -6,121 +6,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags, Index
+from kalmark.arrays import Array, Index
 from kalmark.compiled import compile_on_second_core
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
+from kalmark.filter.estimator_protocols import (
+    Averaging,
+    CompilingEstimator,
+    Correction,
+    Estimator,
+    Initializing,
+    Iterating,
+    Movement,
+    Selective,
+    Update,
+)
 from kalmark.filter.inertial_errors import has_units, turn_own_errors
 from kalmark.filter.map import Map, StochasticMap
+from kalmark.filter.textbook import Textbook
 
 __all__ = [
-    "Averaging", "CompilingEstimator", "Correction", "Ekf", "Estimator", "Fej", "Invariant", "Iterating", "Movement",
-    "Update",
+    "Averaging", "CompilingEstimator", "Correction", "Ekf", "Estimator", "Fej", "Initializing", "Invariant",
+    "Iterating", "Movement", "Selective", "Textbook", "Update",
 ]  # fmt: skip
-
-
-class Update(NamedTuple):
-    """One correction: y (K, m) with noise R (K, p, p), of the first d numbers of the K blocks `slots`.
-
-    `model` is the observation model, compiled (a tuple) or in Python; `robot` and `mount` are slots, `mount` -1 if it
-    is not in the map.  Observations with d2 > gate are not fused.  With `parallax`, inverse distances are corrected by
-    the parallax that they stand for, if the estimator iterates; a sensor that finds depth measures the distances.
-    """
-
-    model: Any
-    robot: int
-    mount: int
-    slots: Index
-    d: int
-    y: Array
-    R: Array
-    gate: float = math.inf
-    parallax: bool = True
-
-
-class Movement(NamedTuple):
-    """One part of a robot's motion: the control u (m,), held for `dt_s` seconds, with the covariance N of its error.
-
-    `model` is the motion, compiled (a tuple) or in Python; `added` are the slots of constant blocks that change the
-    control: their numbers (c,), one after the other, add B (m, c) times them to it.  One has its error where that is
-    `shared` with other parts.  D is the noise gathered in the robot's frame, (0, 0) for none.
-    """
-
-    model: Any
-    robot: int
-    added: Sequence[int]
-    shared: bool
-    B: Array
-    u: Array
-    N: Array
-    D: Array
-    dt_s: float
-
-
-class Correction(NamedTuple):
-    """Of K observations: expectation, innovation and its covariance, squared distance, and which were fused.
-
-    Where the correction is not `valid`, some could not be fused: d2 is infinite of those of which nothing can be
-    expected, NaN of those whose covariance is not positive definite.
-    """
-
-    e: Array
-    z: Array
-    Z: Array
-    d2: Array
-    fused: Flags
-    valid: bool
-
-
-class Estimator(Protocol):
-    """Prediction and correction of the map by motions and scans."""
-
-    coordinates: ClassVar[str]
-    default_gate: ClassVar[float]
-
-    def predict(self, map_: Map, movement: Movement) -> bool:
-        """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
-
-    def correct(self, map_: Map, update: Update) -> Correction:
-        """Fuse a scan."""
-
-    def for_fixes(self) -> Estimator:
-        """Return the estimator that fuses absolute positions."""
-
-    def pose_jacobian(self, map_: Map, robot: int, J: Array) -> Array:
-        """Return the Jacobian J (., 3 or more) in the robot's state, and a mount's behind it, where it linearises."""
-
-
-@runtime_checkable
-class CompilingEstimator(Protocol):
-    """An estimator that is compiled, and can begin with that before it is needed."""
-
-    def compile_ahead(self, axes: int, inverse_depths: bool) -> None:
-        """Begin to compile the correction of a map of these axes on a second core."""
-
-
-@runtime_checkable
-class Iterating(Protocol):
-    """An estimator that linearises an observation more than once."""
-
-    def once(self) -> Estimator:
-        """Return the estimator that linearises everything at the prediction."""
-
-
-@runtime_checkable
-class Averaging(Protocol):
-    """An estimator that can fuse the mean over matchings, as `km.association.Averaged` requires."""
-
-    def average(self, map_: Map, update: Update, pairs: Index, weights: Array) -> tuple[Array, bool]:
-        """Fuse the mean over matchings (H, K), numbers of slots or -1, of these weights (H,).
-
-        Returns d2 (K,) of the pairs of the first one, and whether the covariances are valid.
-        """
 
 
 TOGETHER = 128  # observations of one correction
@@ -308,3 +221,6 @@ class Fej(_Estimator):
         J = J.copy()
         J[:, theta : theta + axes] += J[:, :dof] @ (now - first)
         return J
+
+
+register("estimator", "textbook")(Textbook)  # here: a copy of its file registers under no name of kalmark's

@@ -1,23 +1,33 @@
 """Textbook filters in plain NumPy, to read, to print and to change: dense matrices, full-size Jacobians.
 
 `KalmanFilter` is Algorithm 11.3 of [F], `ExtendedKalmanFilter` the same for functions, `TextbookSlam` is EKF-SLAM as
-[S] 2 and C.3 print it.  Each prints the result of every equation with `show=True`.  `Slam` does not run on these: its
-faster forms are tested against them.
+[S] 2 and C.3 print it.  Each prints the result of every equation with `show=True`.  With the estimator `Textbook`, a
+`Slam` runs on the last one, or on that of a copy of this file in which an equation is changed.  The other estimators
+are faster forms, which are tested against these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Index
+from kalmark.declare import class_of, declared, registered_name
 from kalmark.errors import ModelError
+from kalmark.filter.estimator_protocols import Correction, Movement, Update
+from kalmark.filter.kernels import submatrix
+from kalmark.filter.map import NO_SLOTS, Map, StochasticMap
+from kalmark.filter.prediction import noise_in_world
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import inv_observe, move, observe
+from kalmark.geometry.spaces import POINT2, Space
+from kalmark.models.observe import linearize, step
 
-__all__ = ["ExtendedKalmanFilter", "KalmanFilter", "TextbookSlam"]
+__all__ = ["ExtendedKalmanFilter", "KalmanFilter", "Textbook", "TextbookSlam"]
+COLUMNS = ("range_m", "bearing_rad")
 
 
 class KalmanFilter:
@@ -121,35 +131,51 @@ class ExtendedKalmanFilter:
 
 
 class TextbookSlam:
-    """One robot with a range-bearing sensor at its centre and points: x = (robot, landmarks), P their covariance.
+    """One robot with a range-bearing sensor and points: x = (robot, landmarks), P their covariance.  [S] 2, C.3.
 
-    >>> slam = TextbookSlam(start=[0, 0, 0], Q=np.diag([0.1, 0.05]) ** 2, R=np.diag([0.1, 0.02]) ** 2)
+    `move`, `observe` and `inv_observe` are the models of a robot (x, y, heading) with the sensor at its centre, those
+    of `kalmark.geometry`, and may be replaced.  The last correction has left e, z, Z and K.
+
+    >>> slam = km.textbook.TextbookSlam(start=[0, 0, 0], Q=np.diag([0.1, 0.05]) ** 2, R=np.diag([0.1, 0.02]) ** 2)
+    >>> slam.initialize([2.0, 0.5])
+    0
+    >>> slam.predict([1.0, 0.0])
+    >>> slam.correct(0, [1.2, 0.9])
+    True
+    >>> slam.x.round(3)
+    array([0.999, 0.   , 0.003, 1.75 , 0.953])
     """
 
     def __init__(self, start: Any, Q: Any, R: Any, P: Any = None, show: bool = False) -> None:
         """Start at the pose `start` with covariance P; Q (2, 2) is the noise of (forward, turn), R (2, 2) of (r, b)."""
         self.x = np.array(start, dtype=np.float64)  # (5): x = [R; M], no landmarks yet
-        self.P = np.zeros((3, 3)) if P is None else np.array(P, dtype=np.float64)
+        self.m = m = len(self.x)  # numbers of R
+        self.P = np.zeros((m, m)) if P is None else np.array(P, dtype=np.float64)
         self.Q, self.R, self.show = np.asarray(Q, dtype=np.float64), np.asarray(R, dtype=np.float64), show
+        self.move: Callable[..., Any] = move
+        self.observe: Callable[..., Any] = observe
+        self.inv_observe: Callable[..., Any] = inv_observe
+        self.e = self.z = np.full(2, np.nan)
+        self.Z, self.K = np.full((2, 2), np.nan), np.zeros((m, 2))
 
     def predict(self, u: Any) -> None:
         """Move the robot by u = (forward, turn)."""
-        n = len(self.x)
-        r, F_r, F_n = move(self.x[:3], u, np.zeros(2))
+        m, n, q = self.m, len(self.x), len(self.Q)
+        r, F_r, F_n = self.move(self.x[:m], u, np.zeros(q))
         F = np.eye(n)  # (13)
-        F[:3, :3] = F_r
-        G = np.zeros((n, 2))
-        G[:3] = F_n
-        self.x[:3] = r  # (9)
+        F[:m, :m] = F_r
+        G = np.zeros((n, q))
+        G[:m] = F_n
+        self.x[:m] = r  # (9)
         self.P = F @ self.P @ F.T + G @ self.Q @ G.T  # (10)
         _print(self.show, {"x (9)": self.x, "F_r (12)": F_r, "F_n (12)": F_n, "P (10)": self.P})
 
     def expect(self, i: int) -> tuple[Array, Array]:
         """Return the expectation e (2,) of landmark i and its full-size Jacobian H (2, n)."""
-        at = 3 + 2 * i
-        e, E_r, E_l = observe(self.x[:3], self.x[at : at + 2])
+        at = self.m + 2 * i
+        e, E_r, E_l = self.observe(self.x[: self.m], self.x[at : at + 2])
         H = np.zeros((2, len(self.x)))  # (25)
-        H[:, :3], H[:, at : at + 2] = E_r, E_l
+        H[:, : E_r.shape[1]], H[:, at : at + 2] = E_r, E_l
         return e, H
 
     def correct(self, i: int, y: Any, gate: float = 9.0) -> bool:
@@ -158,9 +184,10 @@ class TextbookSlam:
         z = np.asarray(y) - e  # (19)
         z[1] = wrap(z[1])
         Z = H @ self.P @ H.T + self.R  # (20)
-        if z @ np.linalg.inv(Z) @ z >= gate:  # (83)
+        self.e, self.z, self.Z = e, z, Z
+        if not z @ np.linalg.inv(Z) @ z < gate:  # (83)
             return False
-        K = self.P @ H.T @ np.linalg.inv(Z)  # (21)
+        K = self.K = self.P @ H.T @ np.linalg.inv(Z)  # (21)
         self.x = self.x + K @ z  # (22)
         self.x[2] = wrap(self.x[2])
         self.P = self.P - K @ Z @ K.T  # (23)
@@ -169,16 +196,110 @@ class TextbookSlam:
 
     def initialize(self, y: Any) -> int:
         """Add the landmark sighted at y = (range, bearing); return its number."""
-        n = len(self.x)
-        l, L_r, L_y = inv_observe(self.x[:3], np.asarray(y, dtype=np.float64))  # (32)-(34)
+        m, n = self.m, len(self.x)
+        l, L_r, L_y = self.inv_observe(self.x[:m], np.asarray(y, dtype=np.float64))  # (32)-(34)
         G = np.zeros((2, n))
-        G[:, :3] = L_r
+        G[:, : L_r.shape[1]] = L_r
         P_Lx = G @ self.P  # (36)
         P_LL = P_Lx @ G.T + L_y @ self.R @ L_y.T  # (35)
         self.x = np.concatenate([self.x, l])  # (37)
         self.P = np.block([[self.P, P_Lx.T], [P_Lx, P_LL]])  # (38)
         _print(self.show, {"P_LL (35)": P_LL, "P_Lx (36)": P_Lx, "x (37)": self.x, "P (38)": self.P})
-        return (n - 3) // 2
+        return (n - m) // 2
+
+
+@declared
+class Textbook:
+    """EKF-SLAM as the guide prints it, in dense NumPy: to step through, and to change in a copy of its file.
+
+    Each step is done by `TextbookSlam` with the configured motion and sensor: range and bearing to points of the plane
+    with known ids, by one robot.  Fixes, and landmarks known exactly, are fused by `Ekf`.
+    """
+
+    show: Annotated[bool, "Print the result of each equation."] = False
+
+    coordinates: ClassVar[str] = "world"
+    default_gate: ClassVar[float] = 9.0
+
+    def refuse_misfits(
+        self, robots: Mapping[str, Any], channels: Mapping[Any, Any], policies: Mapping[Any, Any]
+    ) -> None:
+        """Raise ModelError if robots, sensors or landmarks are others than those of the guide."""
+        for misfit in _misfits(robots, channels, policies):
+            raise ModelError(f"estimator {registered_name(type(self)) or type(self).__name__}: {misfit}")
+
+    def predict(self, map_: Map, movement: Movement) -> bool:
+        """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (9)-(10)."""
+        model, robot, added, shared, B, u, N, D, dt_s = movement
+        m, robot, _, slots = map_.movable(robot, added)
+        size, c, d = len(m.index(robot)), len(u), len(D)
+        book, order = self._opened(m, [robot, *slots.tolist()])  # what changes the control is behind the robot's own
+        r, R_r, R_u = step(model, book.x[:size], u + B @ book.x[size : book.m], dt_s)
+        F_r, F_n, Q = np.eye(book.m), np.zeros((book.m, c + d)), np.zeros((c + d, c + d))
+        F_r[:size, :size], F_r[:size, size:] = R_r, R_u @ B
+        F_n[:size, :c], F_n[:d, c:] = R_u, np.eye(d)
+        Q[:c, :c] = 0.0 if shared else N
+        Q[c:, c:] = noise_in_world(r, D) if d else D
+        book.Q, book.move = Q, lambda x, _u, _n: (np.concatenate([r, x[size:]]), F_r, F_n)
+        book.predict(u)
+        if not (np.isfinite(book.x).all() and np.isfinite(book.P).all()):
+            return False
+        _write(m, book, order)
+        m.set_predicted(robot, book.x[:size])
+        return True
+
+    def correct(self, map_: Map, update: Update) -> Correction:
+        """Fuse a scan, one landmark after the other.  [S] (19)-(25)."""
+        y, R = update.y, update.R
+        m, robot, _, slots = map_.opened(update.robot, -1, update.slots, False)
+        number = {slot: i for i, slot in enumerate(dict.fromkeys(slots.tolist()))}
+        book, order = self._opened(m, [robot], [*number])
+        e, z, Z, d2 = np.full_like(y, np.nan), np.full_like(y, np.nan), R.copy(), np.full(len(y), np.nan)
+        fused = np.zeros(len(y), dtype=np.bool_)
+        for k, slot in enumerate(slots.tolist()):
+            book.R, book.observe = R[k], partial(_observed, update.model, y[k])
+            try:
+                fused[k] = book.correct(number[slot], y[k], update.gate)
+            except np.linalg.LinAlgError:  # Z is singular: d2 stays NaN
+                continue
+            e[k], z[k], Z[k] = book.e, book.z, book.Z
+            d2[k] = z[k] @ np.linalg.solve(Z[k], z[k])
+        _write(m, book, order)
+        map_.corrected(update.robot, False)
+        return Correction(e, z, Z, d2, fused, bool((d2 >= 0.0).all()))
+
+    def initialize(self, map_: Map, robot: int, space: Space, l: Array, L_r: Array, Q: Array) -> int:
+        """Add a landmark l (2,) with L_r (2, 3) by the robot's pose and noise Q (2, 2); return its slot.  [S] (37)."""
+        slot = map_.add(space, l)
+        m, robot_here, _, new = map_.opened(robot, -1, np.array([slot]), False)
+        book, order = self._opened(m, [robot_here], new=new.tolist())
+        book.R, book.inv_observe = Q, lambda _r, _y: (l, L_r, np.eye(2))
+        book.initialize(l)
+        _write(m, book, order)
+        map_.corrected(robot, False)
+        return slot
+
+    def _opened(
+        self, m: StochasticMap, robot: list[int], landmarks: Sequence[int] = (), new: Sequence[int] = ()
+    ) -> tuple[TextbookSlam, Index]:  # fmt: skip
+        """Return the filter that has the map's x and P but for `new` blocks, and the order of their rows in it.
+
+        First come the blocks of the robot, then those landmarks, then all others; those that are `new` are the last.
+        """
+        own, seen, added = (np.concatenate([NO_SLOTS, *map(m.index, slots)]) for slots in (robot, landmarks, new))
+        rest = np.setdiff1d(np.arange(m.n), np.concatenate([own, seen, added]))
+        order = np.concatenate([own, seen, rest])
+        book = TextbookSlam(m.x[own], np.eye(2), np.eye(2), show=self.show)
+        book.x, book.P = m.x[order], submatrix(m.P, order)
+        return book, np.concatenate([order, added])
+
+    def for_fixes(self) -> Any:
+        """Return the estimator that fuses absolute positions."""
+        return class_of("estimator", "ekf")()
+
+    def pose_jacobian(self, map_: Map, robot: int, J: Array) -> Array:
+        """Return J as it is: everything is linearised at the estimate."""
+        return J
 
 
 def _with_jacobians(
@@ -213,3 +334,42 @@ def _print(show: bool, results: dict[str, Array]) -> None:
     """Print arrays with their names, if this is to be shown."""
     for name, value in results.items() if show else ():
         print(f"{name} =\n{np.round(value, 4)}")
+
+
+# ---------------------------------------------------------------------- the map of a Slam
+def _misfits(
+    robots: Mapping[str, Any], channels: Mapping[Any, Any], policies: Mapping[Any, Any]
+) -> Iterator[str]:  # fmt: skip
+    """Yield what the guide's filter is not made for, and what is expected."""
+    if len(robots) > 1:
+        yield f"robots are {', '.join(robots)}, expected one"
+    for name, robot in robots.items():
+        if robot.motion.space.world != "plane":
+            yield f"robots.{name}.motion is a {type(robot.motion).__name__} of space, expected one of the plane"
+        for key, mount in robot.sensors.items():
+            if tuple(mount.sensor.columns) != COLUMNS:
+                what = f"robots.{name}.sensors.{key} is a {type(mount.sensor).__name__}"
+                yield f"{what} of {', '.join(mount.sensor.columns)}, expected one of {', '.join(COLUMNS)}"
+    for (name, key), channel in channels.items():
+        policy, what = policies[name, key], f"robots.{name}.sensors.{key}"
+        if registered_name(type(policy.association)) != "identity":
+            yield f"association of {what} is {type(policy.association).__name__}, expected identity: known ids"
+        if channel.landmark.space != POINT2:
+            yield f"landmarks of {what} are {channel.landmark.kind}, expected point"
+        if channel.mount >= 0:
+            yield f"mount of {what} is estimated with the map, expected no sigmas of it and its parameters"
+        if policy.delayed is not None or policy.deferred is not None:
+            yield f"initialization of {what} is late, expected immediate"
+
+
+def _observed(model: Any, y: Array, x: Array, l: Array) -> tuple[Array, Array, Array]:
+    """Return the expectation e (2,) of a landmark l (2,), and E_r (2, 3), E_l (2, 2), by a model of observations."""
+    e, _, E_r, E_l = linearize(model, x[:3].copy(), l[None].copy(), y[None].copy())
+    return e[0], E_r[0], E_l[0]
+
+
+def _write(m: StochasticMap, book: TextbookSlam, order: Index) -> None:
+    """Write x and P of a filter, whose rows are those of a map in this order, into the map."""
+    P = np.zeros((m.n, m.n))
+    P[np.ix_(order, order)] = book.P
+    m.x[order], m.P[: m.n, : m.n] = book.x, np.tril(P)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -24,8 +25,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.declare import registered_name
-from kalmark.filter.estimators import Ekf
+from kalmark.declare import class_of, registered_name
 from kalmark.geometry.gaussian import gate, quantile
 from kalmark.models import sensors
 from kalmark.results.association_errors import LEAST, no_ids
@@ -510,8 +510,9 @@ def _cut_off(run: Recording, sections: list[dict[str, Any]], dof: int) -> float:
     """Return the variance of innovations of `dof` numbers that the gate of a sensor's association leaves of one."""
     own = next((section["association"] for section in sections if section.get("association")), None)
     share = (own or run.config.get("association") or {}).get("gate")
-    if share == "default" and (run.config.get("estimator") or {}).get("type") == "ekf":
-        return truncated_variance(Ekf.default_gate, dof)
+    if share == "default":
+        with suppress(KeyError):  # of a plug-in that is not loaded
+            return truncated_variance(class_of("estimator", run.estimator).default_gate, dof)  # type: ignore[attr-defined]
     return truncated_variance(gate(share, dof), dof) if isinstance(share, float) else 1.0
 
 

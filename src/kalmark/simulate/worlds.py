@@ -175,7 +175,8 @@ class World(OfFile):
     def _laid_over(self, values: dict[str, Any]) -> Tree:
         """Return `values` with `filter` laid over, its keys remembering where they were written."""
         tree = Tree(values=merge_trees(values, deepcopy(self.filter)))
-        known = tree.values.get("map", {}).get("known")
+        of_map = tree.values.get("map")
+        known = of_map.get("known") if isinstance(of_map, dict) else None
         if isinstance(known, str) and known != TRUTH and self._file is not None:  # beside the world, if it is there
             beside = self._file.resolve().parent / known
             tree.values["map"]["known"] = str(beside) if beside.exists() else known

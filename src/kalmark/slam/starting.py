@@ -52,7 +52,7 @@ def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name:
     tentative = held or (name in (NEW, REMAP) and policy.upkeep.confirm > 1)
     name = state.tracks.new_name() if isinstance(name, Answer) else name
     try:
-        track = Track(name, channel.landmark, state.add(start), size_m=scan.size_of(k))
+        track = Track(name, channel.landmark, state.add_seen(start), size_m=scan.size_of(k))
     except MapError as full:
         return Observation(k, id_, "ignored", None, None, str(full))
     if channel.joins:

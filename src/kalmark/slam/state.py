@@ -11,7 +11,7 @@ from kalmark.arrays import Array, Index
 from kalmark.association import Association
 from kalmark.errors import DivergedError, MapError, ModelError
 from kalmark.events import Event, Id, label_of_event
-from kalmark.filter.estimators import Correction, Estimator, Update
+from kalmark.filter.estimators import Correction, Estimator, Initializing, Selective, Update
 from kalmark.filter.map import Map
 from kalmark.filter.maps import DENSE, compress_if_large, new_map
 from kalmark.geometry.spaces import SE2, SE3
@@ -92,6 +92,8 @@ class State:
         first = [source for source in self.sources.values() if not source.waits]
         if len(robots) > 1 or len(first) > 1 or len(self.sources) < len(next(iter(robots.values())).sensors):
             self.settle()
+        if isinstance(self.estimator, Selective):
+            self.estimator.refuse_misfits(robots, self.channels, self.policies)
         self.may_grow = settings.map == "auto" and not any(policy.averages for policy in self.policies.values())
 
     @property
@@ -154,6 +156,12 @@ class State:
     def add(self, start: Start) -> int:
         """Add a block computed from others; return its slot.  Raises MapError where the map is full.  [S] (35)-(38)."""
         return self.map.augment(start.space, start.mean, self.rows(start.parts), start.G, start.Q)
+
+    def add_seen(self, start: Start) -> int:
+        """Add a landmark that a robot sees, as `add`; the estimator does if it can."""
+        if not isinstance(self.estimator, Initializing):
+            return self.add(start)
+        return self.estimator.initialize(self.map, start.parts[0][0], start.space, start.mean, start.G, start.Q)
 
     def add_all(self, starts: Iterable[Start]) -> list[int]:
         """Add blocks, all or none of them; return their slots.  Raises MapError where the map is full."""
