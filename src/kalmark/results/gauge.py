@@ -26,9 +26,9 @@ import numpy as np
 import scipy.linalg as la
 
 from kalmark.arrays import Array, Index
-from kalmark.geometry.rotations import skew
 
-ROUNDS = 10  # until the weights are those of the shape
+ROUNDS, SAME = 10, 1e-6  # until the weights are those of the shape
+REGULAR = 1e-15
 LOW = 0.25  # the quartile
 EXACT_M = 1e-9
 
@@ -54,16 +54,23 @@ class Datum(NamedTuple):
         v = np.trace(own, axis1=1, axis2=2)
         for _ in range(ROUNDS):
             weighted = seen / (v + np.quantile(v, LOW) + EXACT_M**2)[:, None, None]
-            M = np.einsum("kia,kib->ab", weighted, seen)
-            T = np.linalg.pinv(M, hermitian=True) @ weighted.reshape(len(P), len(M)).T
+            w, V = np.linalg.eigh(np.einsum("kia,kib->ab", weighted, seen))
+            regular = w > REGULAR * w.max(initial=0.0)
+            V, w = V[:, regular], w[regular]
+            T = V @ (V / w).T @ weighted.reshape(len(P), len(V)).T
             X = P @ T.T
-            v = np.trace(across @ _moved(own, G, X.reshape(len(points), d, len(M)), T @ X) @ across, axis1=1, axis2=2)
-            v = np.maximum(v, 0.0)
+            before, moved = v, _moved(own, G, X.reshape(*seen.shape), T @ X)
+            v = np.maximum(np.trace(across @ moved @ across, axis1=1, axis2=2), 0.0)
+            if np.all(np.abs(v - before) <= SAME * v):
+                break
         return cls(origin, free @ T, free @ (T @ X) @ free.T)
 
-    def shape(self, G: Array, P: Array, C: Array) -> Array:
-        """Return the covariance (m, m) of the shape of what moves by G (m, q), has P and C (m, n) with the datum's."""
-        return _moved(P, G, C @ self.T.T, self.L)
+    def shape(self, G: Array, P: Array, X: Array) -> Array:
+        """Return the covariances (..., m, m) of the shape of what moves by G (..., m, q), has P, and X = C T'.
+
+        C (..., m, n) are the covariances with the points of the datum.
+        """
+        return _moved(P, G, X, self.L)
 
 
 def generators(points: Array, origin: Array) -> Array:
@@ -74,7 +81,8 @@ def generators(points: Array, origin: Array) -> Array:
     if d == 2:
         G[:, 0, 2], G[:, 1, 2] = -lever[:, 1], lever[:, 0]
     else:
-        G[:, :3, 3:] = -np.array([skew(l) for l in lever]).reshape(-1, 3, 3)
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            G[:, i, 3 + j], G[:, j, 3 + i] = lever[:, k], -lever[:, k]
     return G
 
 
@@ -87,7 +95,7 @@ def shape_of_points(points: Array, P: Array, of: Index) -> Array:
     rows = (of[:, None] * d + np.arange(d)).ravel()
     datum = Datum.of(points[of], np.tile(np.eye(d), (len(of), 1, 1)), P[np.ix_(rows, rows)], np.empty((0, d)))
     C = P[:, rows].reshape(len(points), d, -1)
-    return datum.shape(generators(points, datum.origin)[:, :d], _blocks(P, d), C)
+    return datum.shape(generators(points, datum.origin)[:, :d], _blocks(P, d), C @ datum.T.T)
 
 
 def _moved(P: Array, G: Array, X: Array, L: Array) -> Array:

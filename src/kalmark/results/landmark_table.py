@@ -113,23 +113,22 @@ def shapes(means: Array, covariances: Array, kinds: Sequence[str], d: int = 3) -
     )
 
 
-def _ends(place: Array, d: int) -> Array:
-    """Return the points (1, d) of a place, or both ends (2, d) of a line."""
-    return place.reshape(2, d) if len(place) == 2 * d else place[None, :d]
+def _ends(places: Array, d: int) -> Array:
+    """Return the points (K, 1, d) of places (K, n), of lines both ends (K, 2, d)."""
+    return places.reshape(len(places), 2, d) if places.shape[1] == 2 * d else places[:, None, :d]
 
 
 def _across(ends: Array) -> Array:
-    """Return the projections (N, d, d) across the line through two ends, of a single point 1."""
-    u = ends[-1] - ends[0]
-    return np.tile(np.eye(len(u)) - np.outer(u, u) / max(float(u @ u), TINY), (len(ends), 1, 1))
+    """Return the projections (2, d, d) across the line through two ends (2, d)."""
+    u = ends[1] - ends[0]
+    return np.tile(np.eye(len(u)) - np.outer(u, u) / max(float(u @ u), TINY), (2, 1, 1))
 
 
-def _motion(place: Array, d: int, size: int, origin: Array) -> Array:
-    """Return how the error (size,) of a place moves (size, q) with the world about an origin."""
-    ends = _ends(place, d)
-    G = generators(ends, origin)
-    whole = G[0] if d == 3 and len(place) == TAG else G[:, :d].reshape(-1, G.shape[2])
-    return np.vstack([whole, np.zeros((size - len(whole), G.shape[2]))])
+def _motions(places: Array, d: int, size: int, origin: Array) -> Array:
+    """Return how the errors (K, size) of places (K, n) move, (K, size, q), with the world about an origin."""
+    G = generators(_ends(places, d).reshape(-1, d), origin)
+    whole = G if d == 3 and places.shape[1] == TAG else G[:, :d].reshape(len(places), -1, G.shape[2])
+    return np.pad(whole, ((0, 0), (0, size - whole.shape[1]), (0, 0)))
 
 
 def _place_jacobian(slam: Slam, name: Id) -> Array:
@@ -230,21 +229,29 @@ class MapLandmarks:
         if not len(order):
             return self, own
         some = order[np.unique(np.linspace(0, len(order) - 1, min(DATUM, len(order))).round().astype(int))].tolist()
-        ends, names = [_ends(self.means[k], d) for k in some], [self.ids[k] for k in some]
-        J = la.block_diag(*(_place_jacobian(slam, self.ids[k])[: e.size] for k, e in zip(some, ends, strict=True)))
-        datum = Datum.of(
-            np.concatenate(ends), np.concatenate([_across(e) for e in ends]), J @ slam.covariance(*names) @ J.T,
-            points[exact],
-        )  # fmt: skip
-        out = list(self.covariances)
-        with_datum = dict(_crosses(slam, [*robots, *(self.ids[k] for k in order.tolist())], names))
-        for k in order.tolist():
-            G = _motion(self.means[k], d, len(out[k]), datum.origin)
-            out[k] = datum.shape(G, out[k], _place_jacobian(slam, self.ids[k]) @ with_datum[self.ids[k]] @ J.T)
-        for row, name in enumerate(robots):
-            G = generators(slam.mean(name)[None, :d], datum.origin)[0, :d]
-            own[row] = datum.shape(G, own[row], with_datum[name][:d] @ J.T)
+        ends, names = [_ends(self.means[k][None], d)[0] for k in some], [self.ids[k] for k in some]
+        to_place = {k: _place_jacobian(slam, self.ids[k]) for k in order.tolist()}
+        J = la.block_diag(*(to_place[k][: e.size] for k, e in zip(some, ends, strict=True)))
+        across = np.concatenate([_across(e) if len(e) > 1 else np.eye(d)[None] for e in ends])
+        datum = Datum.of(np.concatenate(ends), across, J @ slam.covariance(*names) @ J.T, points[exact])
+        onto = (datum.T @ J).T
+        X = {name: C @ onto for name, C in _crosses(slam, [*robots, *(self.ids[k] for k in to_place)], names)}
+        out = self._shapes(datum, d, {k: J_k @ X[self.ids[k]] for k, J_k in to_place.items()})
+        G = generators(np.array([slam.mean(name)[:d] for name in robots]).reshape(-1, d), datum.origin)[:, :d]
+        own = datum.shape(G, own, np.array([X[name][:d] for name in robots]).reshape(G.shape))
         return replace(self, covariances=out), own
+
+    def _shapes(self, datum: Datum, d: int, X: Mapping[int, Array]) -> list[Array]:
+        """Return the covariances of the map, of the rows in X = C T' those of their shape; all of one size at once."""
+        out, alike = list(self.covariances), defaultdict[tuple[int, ...], list[int]](list)
+        for k in X:
+            alike[len(self.means[k]), len(out[k])].append(k)
+        for (_, size), rows in alike.items():
+            G = _motions(np.array([self.means[k] for k in rows]), d, size, datum.origin)
+            P = datum.shape(G, np.array([out[k] for k in rows]), np.array([X[k] for k in rows]))
+            for k, P_k in zip(rows, P, strict=True):
+                out[k] = P_k
+        return out
 
     def split(self) -> tuple[MapLandmarks, MapLandmarks]:
         """Return the landmarks of the map, and those known exactly beside it."""
