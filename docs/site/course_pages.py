@@ -6,6 +6,7 @@ Items are the rows of course/items.csv and of the tables in toolbox.md.
 import csv
 import re
 from collections import Counter
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -115,7 +116,7 @@ def table(all_items: list[Item], pages: dict[str, str]) -> str:
         for chapter in dict.fromkeys(each.chapter for each in of_seed):
             out.append(f"### {chapter}\n\n| place | item | state | page | in kalmark |\n|---|---|---|---|---|")
             for each in (one for one in of_seed if one.chapter == chapter):
-                told = " ".join(filter(None, [each.item, each.note]))
+                told = re.sub(r"\]\((?!https?:)", "](../", " ".join(filter(None, [each.item, each.note])))
                 names = ", ".join(linked(name, pages) for name in each.names)
                 page = f"[]({target(each.page)})" if each.page else ""
                 out.append(f"| {each.place} | {told} | {each.state} | {page} | {names} |")
@@ -159,7 +160,15 @@ def linked(name: str, pages: dict[str, str]) -> str:
     return f"`{name}`"
 
 
+def frame(app: Any, doctree: Any) -> None:
+    """Put each figure of a lesson into a box of its own, which scrolls on a narrow page."""
+    nodes = import_module("docutils.nodes")  # the tests of the table need no Sphinx
+    for image in list(doctree.findall(lambda node: type(node).__name__ == "imgsgnode")):
+        image.replace_self(nodes.container("", image.deepcopy(), classes=["figure-of-lesson"]))
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Write the pages before Sphinx reads them."""
     app.connect("builder-inited", write)
+    app.connect("doctree-read", frame)
     return {"parallel_read_safe": True}

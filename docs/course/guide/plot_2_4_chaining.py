@@ -4,14 +4,14 @@ r"""
 
 Four events can happen to a map, and each is one operation of the filter, [S] Table 1:
 
-=============================  =======================  ==================
-event                          in SLAM                  in the filter
-=============================  =======================  ==================
-robot moves                    robot motion             prediction
-sensor detects new landmark    landmark initialization  state augmentation
-sensor observes known landmark map correction           correction
-mapped landmark is corrupted   landmark deletion        state reduction
-=============================  =======================  ==================
+==============================  =======================  ==================
+event                           in SLAM                  in the filter
+==============================  =======================  ==================
+robot moves                     robot motion             prediction
+sensor detects new landmark     landmark initialization  state augmentation
+sensor observes known landmark  map correction           correction
+mapped landmark is corrupted    landmark deletion        state reduction
+==============================  =======================  ==================
 
 The pseudo-code of [S] 2.4 chains them in three loops: over robots, their sensors and the observations of each.
 """
