@@ -90,7 +90,7 @@ def write(app: Any) -> None:
     """Write both pages, if they differ."""
     docs = Path(app.srcdir)
     all_items, pages = items(docs), api_pages.pages()
-    for name, text in (("items", table(all_items, pages)), ("figures", pictures(all_items))):
+    for name, text in (("items", table(all_items, pages)), ("figures", pictures(all_items, docs / "lessons"))):
         file = docs / "lessons" / f"{name}.md"
         file.parent.mkdir(exist_ok=True)
         if not file.exists() or file.read_text() != text:
@@ -124,8 +124,8 @@ def table(all_items: list[Item], pages: dict[str, str]) -> str:
     return "\n".join(out)
 
 
-def pictures(all_items: list[Item]) -> str:
-    """Return the page of the figures that lessons draw again."""
+def pictures(all_items: list[Item], lessons: Path) -> str:
+    """Return the page of the figures that lessons draw again: the last picture of each lesson, which is complete."""
     out = [
         "# Figures of the four documents\n",
         "Each figure by its number, as a lesson of the course draws it from what it computes.\n",
@@ -136,8 +136,10 @@ def pictures(all_items: list[Item]) -> str:
             for each in all_items:
                 if each.seed == seed and number in each.numbers["Figure"] and "/plot_" in each.page:
                     folder, name = each.page.split("/")
+                    drawn = [path.name for path in (lessons / folder / "images").glob(f"sphx_glr_{name}_00?.png")]
+                    picture = max(drawn, default=f"sphx_glr_{name}_001.png")
                     out.append(f":::{{grid-item-card}} Figure {number}\n:link: {each.page}\n:link-type: doc")
-                    out.append(f":img-bottom: {folder}/images/sphx_glr_{name}_001.png\n\n{each.item}\n:::\n")
+                    out.append(f":img-bottom: {folder}/images/{picture}\n\n{each.item}\n:::\n")
                     break
         out.append("::::\n")
     return "\n".join(out)

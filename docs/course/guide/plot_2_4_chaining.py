@@ -71,6 +71,3 @@ ax.legend()
 #   24 new landmarks in place of 28.
 # * No deletion: ``if time % 10 == 10``. All 24 landmarks stay: 54 numbers at the end, in place of 52, and 24 starts in
 #   place of 28, since a deleted landmark that is seen again starts again.
-#
-# ``km.Upkeep`` decides which landmarks are confirmed and deleted, ``km.Attention`` which observations a sensor uses:
-# the map manager and the data manager of [S] Figure 2.
