@@ -36,6 +36,16 @@ ax.set(yscale="log", xlabel="observation", ylabel="NIS per degree of freedom")
 ax.legend(title="stated noise of the range", loc="center right")
 
 # %%
+# Move both noises
+# ----------------
+#
+# The page below has the beginning of that log, filtered with 81 noises. Move the sliders, or click the picture of the
+# likelihood. ``kalmark tune CONFIG --page sliders.html`` makes such a page of your own log.
+from kalmark.diagnosis.sliders import sliders
+
+sliders(world.config(), log, seconds=12.0)
+
+# %%
 # Which part is wrong
 # -------------------
 #

@@ -123,12 +123,16 @@ def tune(
     if not 0.0 < share < 1.0 or aim not in AIMS:
         raise KalmarkError(f"tune: got share {share!r} and aim {aim!r}, expected a share in (0, 1) and one of {AIMS}")
     made, log = open_run(config, log_path, overrides)
+    return Task(config_dict(made), log, share, {*keep}, written_robots(config, overrides), progress).tuned(aim)
+
+
+def written_robots(config: str | Path, overrides: Sequence[str]) -> Mapping[str, Any]:
+    """Return the section of robots as it stands in the file of a configuration, {} if it has none."""
     written = read_tree(resolve_config(config), overrides).values.get("robots")
-    task = _Task(config_dict(made), log, share, {*keep}, written if isinstance(written, dict) else {}, progress)
-    return task.tuned(aim)
+    return written if isinstance(written, dict) else {}
 
 
-class _Judged(NamedTuple):
+class Judged(NamedTuple):
     """A run over the whole log: which observations (O,) were used, their d2, degrees of freedom and log-likelihood."""
 
     run: Run
@@ -148,7 +152,7 @@ class _Fit(NamedTuple):
     alike: dict[Path_, str]
 
 
-class _Task:
+class Task:
     """A configuration and a log in two parts."""
 
     def __init__(
@@ -165,7 +169,7 @@ class _Task:
         made = config_of(Tree(self.keys.changed(values)), None)
         return record(build_slam(made, log), log, progress=False, config=config_dict(made), pictures=False)
 
-    def judged(self, values: Values) -> _Judged:
+    def judged(self, values: Values) -> Judged:
         """Return the whole log filtered with some values."""
         run = self.run(values, self.log)
         h = run.history
@@ -176,9 +180,9 @@ class _Task:
             mine = np.flatnonzero(dof == m)
             logdet = np.linalg.slogdet(h.Z[mine, :m, :m])[1]
             likelihood[mine] = -0.5 * (d2[mine] + logdet + m * math.log(2 * math.pi))
-        return _Judged(run, h.outcome == "associated", d2, dof, likelihood)
+        return Judged(run, h.outcome == "associated", d2, dof, likelihood)
 
-    def scores(self, judged: _Judged, before: _Judged) -> tuple[Score, Score]:
+    def scores(self, judged: Judged, before: Judged) -> tuple[Score, Score]:
         """Return the scores of both parts.
 
         An observation that was left out is as likely as at the edge of the gate before: no noise gains by leaving out.
@@ -328,7 +332,7 @@ class _Task:
         ]
         return changes
 
-    def _held_out(self, values: Values, changes: list[Change], before: _Judged) -> tuple[Values, list[Change]]:
+    def _held_out(self, values: Values, changes: list[Change], before: Judged) -> tuple[Values, list[Change]]:
         """Return the values without those that do not make the second part's innovations likelier, and why."""
         whole = self.scores(self.judged(values), before)[1].likelihood
         base = self.scores(before, before)[1].likelihood

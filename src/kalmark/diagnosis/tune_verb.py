@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -33,9 +34,18 @@ def tune(
     keep: Annotated[
         list[str] | None, typer.Option(metavar="KEY.PATH", help="Do not touch; may be given again.")
     ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="Instead, write a page on which two sliders choose the noise, as an HTML file.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Of the log, for the page. (default: its first 400 scans)")
+    ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Estimate noise and calibration by the first part of a log, and write a configuration that has them."""
+    if page is not None:
+        write_page(page, config, log, overrides or (), seconds)
+        return
     from kalmark.diagnosis.tune import tune as tuned
     from kalmark.diagnosis.tune_picture import draw_tuning
     from kalmark.diagnosis.tuned_file import new_config
@@ -54,6 +64,26 @@ def tune(
     save_figure(draw_tuning(tuning, Path(config).stem), picture)
     print_tuning(tuning)
     say(f"{out}: the new configuration; {picture}: the NIS before and after")
+
+
+def write_page(
+    page: Path, config: str, log: Path | None, overrides: Sequence[str], seconds: float | None
+) -> None:  # fmt: skip
+    """Write the page of sliders of a configuration and the beginning of its log."""
+    from kalmark.config import open_run
+    from kalmark.diagnosis.sliders import sliders
+    from kalmark.diagnosis.tune import written_robots
+
+    if page.suffix != ".html":
+        raise KalmarkError(f"--page {page}: expected a path that ends with .html")
+    writable(page.parent)
+    with limit_blas_threads():
+        made, opened = open_run(config, log, overrides)
+        written = written_robots(config, overrides)
+        found = sliders(made, opened, seconds=seconds, written=written, progress=True)
+    page.parent.mkdir(parents=True, exist_ok=True)
+    found.save(page)
+    say(f"{page}: open it in a browser; it needs no network")
 
 
 def print_tuning(tuning: Tuning) -> None:
