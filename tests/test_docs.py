@@ -68,6 +68,19 @@ def test_a_tutorial_runs(tutorial: Path, tmp_path: Path, monkeypatch: pytest.Mon
     run_in_this_process(tutorial, tmp_path, monkeypatch)
 
 
+@pytest.mark.parametrize("program", [*LESSONS, *TUTORIALS], ids=lambda p: p.stem)
+def test_a_figure_is_drawn_in_one_block_or_deferred(program: Path) -> None:
+    """The gallery shows and closes all figures at the end of a block."""
+    *before, last = re.split(r"^# %%\n", program.read_text(), flags=re.M)
+    for k, block in enumerate(before):
+        made = re.findall(r"^ *(.*?) = (?:plt\.(?:subplots|figure)|\(?figure\.add_subplot)", block, re.M)
+        later = "".join(re.findall(r"^[^#\n].*\n", "".join([*before[k + 1 :], last]), re.M))
+        again = re.compile(r"plt\.(?:subplots|figure)\(").search(later)
+        names = set(re.findall(r"\w+", " ".join(made)))
+        if names & set(re.findall(r"\w+", later[: again.start() if again else None])):
+            assert "# sphinx_gallery_defer_figures" in block, f"{program.name}: {names}"
+
+
 def run_in_this_process(program: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run a program of the site; forget the models and formats that it registers."""
     monkeypatch.chdir(folder)

@@ -43,6 +43,7 @@ m, M = km.geometry.merge(*ends[0], *ends[1])
 print(f"merged: {m.round(2)}, sigmas {np.sqrt(np.diag(M)).round(3)}")
 ax.plot(*km.geometry.ellipse(m[:2], M[:2, :2], 2, 60).T, "k", lw=2)
 ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+# sphinx_gallery_defer_figures
 
 # %%
 # As resistances

@@ -42,6 +42,7 @@ for robot in robots:
         print(f"robot {robot.name}, sensor {name}: {seen}")
         ax.plot(*at[:2], "ks", ms=5)
         ax.plot(*np.swapaxes([at[:2] + 0 * world[ids], world[ids]], 0, 2).swapaxes(1, 2), "C7:")
+# sphinx_gallery_defer_figures
 
 # %%
 # Figure 1

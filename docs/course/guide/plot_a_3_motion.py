@@ -37,6 +37,7 @@ for step in range(1, 61):
     if step % 20 == 0:
         ax.plot(*robots[:, :2].T, f"C{step // 20}.", alpha=0.4, label=f"after {step} steps")
         ax.plot(*km.geometry.ellipse(slam.x[:2], slam.P[:2, :2], sigmas=2, points=60).T, "k")
+# sphinx_gallery_defer_figures
 
 # %%
 # Where they are

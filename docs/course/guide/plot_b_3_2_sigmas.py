@@ -33,6 +33,7 @@ for n in (1, 2, 3, 4):
     print(f"{n} sigma: {inside:.2%}, by the law {km.geometry.sigma_probability(n, dof=2):.2%}")
 left.set(aspect="equal", xlabel="x", ylabel="y")
 left.legend(loc="upper left", fontsize="small")
+# sphinx_gallery_defer_figures
 
 # %%
 # Table 3 for any dimension
