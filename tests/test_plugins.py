@@ -74,7 +74,7 @@ stop = stops
 Tram = trams:Tram
 """
 AGAIN = "; expected it installed: pip install --force-reinstall --no-deps kalmark"
-OUTSIDE = ("kalmark.bags", "kalmark.datasets", "kalmark.diagnosis", "kalmark.vision")
+OUTSIDE = ("kalmark.bags", "kalmark.datasets", "kalmark.diagnosis", "kalmark.viewer", "kalmark.vision")
 WITHOUT = f"""
 import sys
 

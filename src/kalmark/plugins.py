@@ -8,6 +8,7 @@
 | `kalmark.keys` | a key of sensors: a module with `complete(tree)` and `with_events(config, log)` |
 | `kalmark.verbs` | a function of the command line |
 | `kalmark.writers` | what `kalmark convert` writes, under the ending of its file: `(path, log, run) -> {part: count}` |
+| `kalmark.viewers` | a viewer of runs: a module with `replay(run, save)` and `follow(slam, log, picture, save)` |
 | `kalmark.names` | a name of the package `kalmark` |
 
 Nothing is imported before it is asked for, and one that cannot be loaded stops no other.

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from command_line import Kalmark, refused, write_log, write_log_of_space
+from kalmark.errors import PluginError
 from kalmark.results.compare import compare, draw_comparison
 from kalmark.results.run import Run
 
@@ -52,6 +53,10 @@ def test_fewer_than_two_runs_are_refused(kalmark: Kalmark, runs: list[str]) -> N
     assert "none" in refused(kalmark("compare", "a", "none"))
 
 
+def without_viewer(*names: str) -> None:
+    raise PluginError("no viewer is installed")
+
+
 def test_the_page_of_a_run_is_opened(kalmark: Kalmark, runs: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
 
@@ -61,8 +66,12 @@ def test_the_page_of_a_run_is_opened(kalmark: Kalmark, runs: list[str], monkeypa
 
     monkeypatch.setattr("webbrowser.open", browse)
     Path("a/report.html").unlink()
-    assert kalmark("view", "a").out == "a/report.html\n"
+    assert kalmark("view", "a", "--page").out == "a/report.html\n"
     assert opened == [Path("a/report.html").resolve().as_uri()] and 'id="play"' in Path("a/report.html").read_text()
-    assert kalmark("view", "a").out == "a/report.html: no browser was found, open it yourself\n"
+    monkeypatch.setattr("kalmark.plugins.load", without_viewer)
+    shown = kalmark("view", "a")
+    assert shown.out == "a/report.html: no browser was found, open it yourself\n"
+    assert shown.err == "no viewer is installed; this is the page\n"
+    assert refused(kalmark("view", "a", "--save", "a.rrd")) == "no viewer is installed"
     assert kalmark("view", "a", "--no-open").out == "a/report.html\n" and len(opened) == 2
     assert "none" in refused(kalmark("view", "none"))

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from kalmark.cli.shared import RunFolder, Trust, limit_blas_threads, print_summary, print_table, say, writable
+from kalmark.errors import PluginError
 
 
 def evaluate(
@@ -73,18 +74,34 @@ def report(
 def view(
     run: RunFolder,
     trust: Trust = False,
+    page: Annotated[bool, typer.Option("--page", help="Show its page in a browser, not the viewer.")] = False,
+    save: Annotated[
+        Path | None, typer.Option(metavar="FILE.rrd", help="Write what the viewer would show to a file of rerun.")
+    ] = None,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
 ) -> None:
-    """Replay a run: its page, with a slider through time, a map that turns, errors and associations."""
+    """Replay a run in rerun, or without it on its page: a slider through time, the map, errors and associations."""
     import webbrowser
 
+    from kalmark.plugins import load
     from kalmark.results.run import Run
 
-    page = run / "report.html"
-    if not page.is_file() or not (run / "summary.json").is_file():
+    if save is not None or (open_ and not page):
+        loaded = Run.load(run, trust)
+        try:
+            load("viewers", "rerun").replay(loaded, save)
+        except PluginError as error:
+            if save is not None:
+                raise
+            say(f"{error}; this is the page", err=True)
+        else:
+            say("rerun shows it" if save is None else str(save))
+            return
+    file = run / "report.html"
+    if not file.is_file() or not (run / "summary.json").is_file():
         Run.load(run, trust).report(run)
-    shown = open_ and webbrowser.open(page.resolve().as_uri())
-    say(f"{page}{'' if shown or not open_ else ': no browser was found, open it yourself'}")
+    shown = open_ and webbrowser.open(file.resolve().as_uri())
+    say(f"{file}{'' if shown or not open_ else ': no browser was found, open it yourself'}")
 
 
 def compare(

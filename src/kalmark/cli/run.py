@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,8 @@ from kalmark.errors import KalmarkError, PluginError, RunError
 from kalmark.plugins import load
 
 if TYPE_CHECKING:
+    from kalmark.events import Event
+    from kalmark.report import Report
     from kalmark.results.run import Run
 
 SHOWN = 5
@@ -36,9 +39,11 @@ def run_log(
     on_error: str | None = None,
     progress: bool = True,
     own: Path | None = None,
+    follow: Callable[..., Callable[[Event, Report], object]] | None = None,
 ) -> Run:
     """Return the run of a configuration over the log that it names, or over another one read in the same way.
 
+    `follow`, given the filter, the log and the options of pictures, returns what observes each event and its report.
     Raises RunError, before anything is computed, if the run folder `own` has the result of another log.
     """
     from kalmark import config as cfg
@@ -49,7 +54,9 @@ def run_log(
     if own is not None:
         refuse_other_log(own, str(log.path))
     slam = cfg.build_slam(config, log)
-    return record(slam, log, progress=progress, on_error=config.log.on_error, config=cfg.config_dict(config))
+    observers = () if follow is None else (follow(slam, log, cfg.build_picture(config)),)
+    whole = cfg.config_dict(config)
+    return record(slam, log, progress=progress, on_error=config.log.on_error, config=whole, observers=observers)
 
 
 def refuse_other_log(folder: Path, path: str) -> None:
@@ -77,6 +84,10 @@ def run(
         bool | None,
         typer.Option(help="Compare with the batch solution. (default: if tags' corners were seen)"),
     ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the filter while it runs.")] = False,
+    view_to: Annotated[
+        Path | None, typer.Option(metavar="FILE.rrd", help="Write what --view shows to a file of rerun.")
+    ] = None,
 ) -> None:
     """Run one log through one filter and write a run folder."""
     from kalmark.config.tree import name_of, name_on
@@ -85,7 +96,8 @@ def run(
     own, out = usual if out is None else None, writable(out or usual)
     with limit_blas_threads():
         left_out = on_error.value if on_error else None
-        result = run_log(config, log, overrides=overrides or (), on_error=left_out, own=own)
+        follow = partial(load("viewers", "rerun").follow, save=view_to) if view or view_to is not None else None
+        result = run_log(config, log, overrides=overrides or (), on_error=left_out, own=own, follow=follow)
         summary = result.evaluate()
         if batch or (batch is None and summary.get("corner_rms_px") is not None):
             try:

@@ -31,6 +31,7 @@ from kalmark.models.landmark_views import Raised
 from kalmark.models.landmarks import PointHeight2D
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import state_columns
+from kalmark.picture_options import USUAL, Picture
 from kalmark.slam.description import EXACT, OF_PLACE, covariance_of, describe_place, state_of
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
@@ -99,6 +100,12 @@ def slam_described(said: dict[str, Any], **given: Any) -> Slam:
     """Return the filter that `kalmark.slam.description.describe` describes, with models `given` for some of it."""
     kept = {key: value for key, value in said.items() if key not in given}
     return build_slam(validate(Tree(kept, places={(): "settings"}), Config), **given)
+
+
+def build_picture(config: Config) -> Picture:
+    """Return the options of pictures that a configuration has.  Raises ModelError if they do not fit together."""
+    given: Picture | None = model_of(config.picture)
+    return given or USUAL
 
 
 def config_dict(config: Config) -> dict[str, Any]:

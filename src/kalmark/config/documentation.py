@@ -92,7 +92,8 @@ def page() -> str:
     parts += [_choice("`landmarks`, and `landmark` of a sensor", "landmark")]
     parts += [_choice("`association`, also of a sensor", "association")]
     parts += [_section("`upkeep`, also of a sensor", section_of("upkeep", "upkeep"))]
-    return "\n".join([*parts, _choice("`estimator`", "estimator"), _section("`map`", schema.MapConfig)])
+    parts += [_choice("`estimator`", "estimator"), _section("`map`", schema.MapConfig)]
+    return "\n".join([*parts, _section("`picture`", section_of("picture", "picture"))])
 
 
 def _section(title: str, model: type[BaseModel], common: type[BaseModel] = Section) -> str:

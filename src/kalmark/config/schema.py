@@ -44,6 +44,7 @@ Initialization = Annotated[Any, Choice("initialization", default="immediate")]
 Detector = Annotated[Any, Choice("detector")]
 Attention = Annotated[Any, Choice("attention", typed=False)]
 Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
+Picture = Annotated[Any, Choice("picture", typed=False)]
 
 Plugins = Annotated[tuple[str, ...], Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
@@ -461,6 +462,8 @@ class Config(OfFile):
     """Filter."""
     map: MapConfig = MapConfig()
     """Covariance storage."""
+    picture: Picture | None = None
+    """Content and view of map.png, the page, videos and `kalmark view`."""
     longest_pause_s: Positive = LONGEST_PAUSE_S
     """An event that comes later after the one before it has a wrong stamp and is refused; 10 such in a row are not."""
 

@@ -16,6 +16,7 @@ from kalmark.report import Report
 from kalmark.results.filter_description import cameras, mount_now, observed_points
 from kalmark.results.history import RobotStart
 from kalmark.results.landmark_table import MapLandmarks, shapes
+from kalmark.results.measures import Rigid
 from kalmark.results.scene import Ray, Scene, drawn_box, places_of
 from kalmark.results.truth import ORIGIN, as_rigid, frame_offset, landmarks_of_size, move_landmarks, poses_of_size
 
@@ -169,7 +170,8 @@ def truth_until_now(slam: Slam, truth: Any, size: int) -> tuple[dict[str, Array]
     return _poses_by_robot(robots, tuple(slam.robots), size, "truth"), landmarks
 
 
-def _logged_truth(slam: Slam, log: Log, size: int) -> tuple[dict[str, Array], dict[Id, Array]]:
+def truth_to_map(slam: Slam, log: Log, size: int) -> Rigid:
+    """Return the transform from the frame of a log's truth to that of the map, poses having `size` numbers."""
     starts = []
     for name, robot in slam.robots.items():
         t_ns, dof = begins_at(log.events, name, robot.motion.held), robot.motion.space.dof
@@ -177,7 +179,11 @@ def _logged_truth(slam: Slam, log: Log, size: int) -> tuple[dict[str, Array], di
             P = np.zeros((dof, dof)) if robot.cov is None else np.asarray(robot.cov)
             starts.append(RobotStart(name, np.asarray(robot.start), P, t_ns))
     anchored = len(slam.tracks.known) or any(type(event) is Fix for event in log.events)
-    to_map = as_rigid(ORIGIN[size] if anchored else frame_offset(log.truth, starts, size))
+    return as_rigid(ORIGIN[size] if anchored else frame_offset(log.truth, starts, size))
+
+
+def _logged_truth(slam: Slam, log: Log, size: int) -> tuple[dict[str, Array], dict[Id, Array]]:
+    to_map = truth_to_map(slam, log, size)
     until, out = slam.t_ns or 0, {}
     for name in log.truth.keys() & slam.robots.keys():
         true = log.truth[name]

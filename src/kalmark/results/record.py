@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -68,6 +68,7 @@ def record(
     on_error: Literal["raise", "skip"] = "raise",
     config: Mapping[str, Any] | None = None,
     pictures: bool = True,
+    observers: Iterable[Callable[[Event, Report], object]] = (),
 ) -> Run:
     """Process every event of a log (or of any iterable) and return the run, ready to evaluate and save.
 
@@ -76,7 +77,8 @@ def record(
     that diverges so far that it refuses to go on ends the run in either case: `run.stopped` is the reason and the
     summary has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's
     models.  Without `pictures` the maps on the way and what was in view are left out, which is faster; the verdict
-    on such a run is without the map before a jump.  Raises LogError if the log has other columns than the filter's
+    on such a run is without the map before a jump.  Each of the `observers` is called with each event and its report.
+    Raises LogError if the log has other columns than the filter's
     motions and sensors, or two units of time.
 
     >>> rover = km.Robot("rover", km.motion.Unicycle())
@@ -90,12 +92,14 @@ def record(
     refuse_other_columns(slam, log)
     refuse_other_times(log)
     slam.prepare_for(log.events)
-    recorder = _Recorder(slam, log, pictures)
+    recorder, observers = _Recorder(slam, log, pictures), tuple(observers)
     begin = time.perf_counter()
     with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.expectations:
         for event in track(log.events, log.name or "log", len(log.events), show=progress, note=recorder.rate):
             try:
-                recorder.process(event)
+                report = recorder.process(event)
+                for observe in observers:
+                    observe(event, report)
             except EventError as error:
                 if on_error == "raise" and not isinstance(error, ImageError):
                     raise
@@ -194,10 +198,10 @@ class _Recorder:
         latest = [ns for ns in self.step_ns[-LATEST:] if not math.isnan(ns)]
         return f"{1e9 * len(latest) / sum(latest):.0f} images/s" if self.has_images and latest else ""
 
-    def process(self, event: Event) -> None:
-        """Feed one event and, if it is a scan, keep the step that ends with it; of a log without scans, if it is a fix.
+    def process(self, event: Event) -> Report:
+        """Feed one event, return its report, and keep the step that ends with it: with a scan, if the log has any.
 
-        Of one without either, if it is a control.
+        Of a log without scans with a fix, of one without either with a control.
         """
         start = time.perf_counter_ns()
         try:
@@ -219,8 +223,11 @@ class _Recorder:
             mine = [each for scan, each in of if (scan.robot, scan.sensor) == (event.robot, event.sensor)]
             before = sum(o.outcome == "associated" for each in mine for o in each.observations)
             self.placed.append(RelocatedRobot(event.t_ns, event.robot, event.sensor, report.replaced, before))
-        if not isinstance(event, self.stepped):
-            return
+        if isinstance(event, self.stepped):
+            self._step(event, report)
+        return report
+
+    def _step(self, event: Event, report: Report) -> None:
         scan = report.event  # of raw data, what the detector found
         if not isinstance(scan, Scan):
             scan = Scan(t_ns=event.t_ns, robot=event.robot)

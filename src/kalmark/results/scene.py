@@ -22,6 +22,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.geometry.rotations import matrix
 from kalmark.picture_options import USUAL, Picture
+from kalmark.report import Report
 from kalmark.results.control_gaps import while_lost
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
 from kalmark.results.history import Camera, History, Ints, MapSnapshot, Measuring
@@ -411,13 +412,9 @@ def images(history: History, camera: Camera, step: int) -> list[Image]:
     points = _points(camera)
     found = [Image(SIDES[side], []) for side in points]
     for row in np.flatnonzero(history.step == step):
-        y, e, z, Z = history.y[row], history.e[row], history.z[row], history.Z[row]
-        whole = np.isfinite(z).sum() == np.isfinite(y).sum()
         name, outcome = str(history.landmark[row]) or str(history.id[row]), str(history.outcome[row])
-        for image, at in zip(found, points.values(), strict=True):
-            Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
-            euclidean = str(history.kind[row]) in EUCLIDEAN
-            image.sightings.append(Sighting(name, outcome, euclidean, y[at], e[at], Z_at))
+        of = history.y[row], history.e[row], history.z[row], history.Z[row]
+        _add_sighting(found, points, (name, outcome, str(history.kind[row]) in EUCLIDEAN), of)
     for row in np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == camera.sensor)):
         e, Z, name = history.unmeasured_e[row], history.unmeasured_Z[row], str(history.unmeasured_landmark[row])
         for image, at in zip(found, points.values(), strict=True):
@@ -425,6 +422,28 @@ def images(history: History, camera: Camera, step: int) -> list[Image]:
             euclidean = str(history.unmeasured_kind[row]) in EUCLIDEAN
             image.sightings.append(Sighting(name, IN_VIEW, euclidean, np.empty((0, 2)), e[at], Z_at))
     return found
+
+
+def images_of_report(camera: Camera, report: Report, kinds: Sequence[str]) -> list[Image]:
+    """Return the images of a scan that a camera made; `kinds` are those of the landmarks of its observations."""
+    points = _points(camera)
+    found = [Image(SIDES[side], []) for side in points]
+    for o, kind in zip(report.observations, kinds, strict=True):
+        name = "" if o.landmark is None and o.id is None else str(o.id if o.landmark is None else o.landmark)
+        of = report.y[o.index], report.e[o.index], report.z[o.index], report.Z[o.index]
+        _add_sighting(found, points, (name, o.outcome, kind in EUCLIDEAN), of)
+    return found
+
+
+def _add_sighting(
+    found: list[Image], points: Mapping[str, Ints], named: tuple[str, str, bool], of: tuple[Array, Array, Array, Array]
+) -> None:
+    """Add an observation to the images that it is in: its name, outcome and whether it is Euclidean; y, e, z and Z."""
+    y, e, z, Z = of
+    whole = np.isfinite(z).sum() == np.isfinite(y).sum()
+    for image, at in zip(found, points.values(), strict=True):
+        Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
+        image.sightings.append(Sighting(*named, y[at], e[at], Z_at))
 
 
 def colour_of(sighting: Sighting) -> tuple[str, str]:
