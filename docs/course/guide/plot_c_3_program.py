@@ -69,3 +69,5 @@ animation = FuncAnimation(figure, draw, frames=range(3, 200, 8), interval=240)
 #   before (0.016): every step is corrected by all landmarks.
 # * The corrections: ``if number in (0, 1): slam.correct(number, Y[i])``. Two landmarks of 36 are enough to keep the
 #   error of the position at 3 cm; its sigma in x grows from 0.064 m to 0.094 m.
+# * The filter: ``estimator: textbook`` runs it in ``kalmark run``, on any log, with equations that you change
+#   (:doc:`/textbook`). Two sliders choose its noise in :doc:`/how/plot_10_choosing_noise`.
