@@ -75,7 +75,7 @@ def test_a_figure_is_drawn_in_one_block_or_deferred(program: Path) -> None:
     for k, block in enumerate(before):
         made = re.findall(r"^ *(.*?) = (?:plt\.(?:subplots|figure)|\(?figure\.add_subplot)", block, re.M)
         later = "".join(re.findall(r"^[^#\n].*\n", "".join([*before[k + 1 :], last]), re.M))
-        again = re.compile(r"plt\.(?:subplots|figure)\(").search(later)
+        again = re.search(r"^.*plt\.(?:subplots|figure)\(", later, re.M)
         names = set(re.findall(r"\w+", " ".join(made)))
         if names & set(re.findall(r"\w+", later[: again.start() if again else None])):
             assert "# sphinx_gallery_defer_figures" in block, f"{program.name}: {names}"
