@@ -72,7 +72,7 @@ def test_a_beacon_is_started_honestly_over_sixty_trials(way: Any) -> None:
 
 def test_four_beacons_and_the_scale_of_their_ranges_are_found_together() -> None:
     errors, sure = [], []
-    for seed in range(12):
+    for seed in range(6):
         rng = np.random.default_rng(100 + seed)
         scale = 1 + 0.07 * rng.normal()
         events, r, beacons = world(seed, steps=80, count=4, low=10.0, high=30.0, scale=scale)
@@ -81,7 +81,7 @@ def test_four_beacons_and_the_scale_of_their_ranges_are_found_together() -> None
         gain, sigma = slam.mean("r.radio")[3], np.sqrt(slam.covariance("r.radio")[3, 3])
         errors.append((gain - 1 / scale) / sigma)
         sure += [d2(slam, r, i, beacons[i]) < 9.21 for i in slam.landmarks().ids]
-    assert len(sure) >= 40
+    assert len(sure) >= 20
     assert np.mean(sure) > 0.9
     assert np.sqrt(np.mean(np.square(errors))) < 1.7
 
