@@ -19,11 +19,11 @@ The state gets two numbers more, and the covariance two rows and columns:
 """
 
 # %%
-# Right surgery, and two that forget something
-# --------------------------------------------
+# The right surgery, and two wrong ones
+# -------------------------------------
 #
-# ``augment`` does it for any :math:`h`. The second filter forgets the cross-covariance, the third one the uncertainty
-# of the pose, too. Then all three see the landmark again from the same pose, a hundred times.
+# ``augment`` does it for any :math:`h`. The second filter leaves out the cross-covariance, the third one the
+# uncertainty of the pose, too. Then all three see the landmark again from the same pose, a hundred times.
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -58,8 +58,8 @@ for name in ("surgery", "no cross-covariance", "pose taken as exact"):
 # The covariance after the start
 # ------------------------------
 #
-# One landmark, seen from one place, says nothing about where the robot is in the world. Only the right surgery knows:
-# its sigmas of the pose stay 0.5 m, 0.3 m and 0.1 rad. The other two become sure of a pose that nothing has measured.
+# One landmark, seen from one place, says nothing about where the robot is in the world. With the right
+# surgery the sigmas of the pose stay 0.5 m, 0.3 m and 0.1 rad. In the other two they fall, though nothing was measured.
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), layout="constrained")
 for ax, (name, Sigma) in zip(axes, pictures.items(), strict=True):
     ax.imshow(np.sqrt(np.abs(Sigma)), cmap="Greys")

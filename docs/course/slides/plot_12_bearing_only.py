@@ -69,7 +69,7 @@ for ax, (name, (distance, spread)) in zip(axes, priors.items(), strict=True):
 # ------------
 #
 # * A better sensor: ``np.radians(0.1)``. With the wide prior no run is within 3 sigma, in place of 20 %: the smaller
-#   the noise, the less an error of the linearization is forgiven.
+#   the noise, the larger the error of the linearization is in sigmas.
 # * Another distance: ``np.array([12.0, 0.0])``. The narrow prior is wrong now: 0 %, 54 % and 64 %.
 # * More bearings, nearer to each other: ``0.1 * np.arange(1, 31)``. The wide prior is right in 70 % of the runs, since
 #   each correction changes the estimate by less.

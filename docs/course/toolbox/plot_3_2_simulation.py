@@ -47,6 +47,6 @@ for k, (name, world) in enumerate(worlds.items()):
 # Try changing
 # ------------
 #
-# * Noise of the camera: ``"robots.robot.sensors.camera.sigma_px=20"`` beside ``steps``. The house falls apart: the
-#   ends of a segment have noise of their own.
+# * Noise of the camera: ``"robots.robot.sensors.camera.sigma_px=20"`` beside ``steps``. The segments of
+#   the house do not meet any more: the ends of each have noise of their own.
 # * A layout of your own: :doc:`/how/plot_07_own_world`.

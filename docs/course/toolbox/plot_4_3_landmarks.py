@@ -8,8 +8,8 @@ measurement nearly linear. In kalmark they are
 
 .. math::
 
-   \text{inverse\_depth} &: (p_0, \varepsilon, \alpha, \rho), \qquad p = p_0 + m(\varepsilon, \alpha) / \rho \\
-   \text{anchored\_homogeneous} &: (p_0, v, \rho), \qquad p = p_0 + v / \rho \\
+   \text{inverse depth} &: (p_0, \varepsilon, \alpha, \rho), \qquad p = p_0 + m(\varepsilon, \alpha) / \rho \\
+   \text{anchored homogeneous} &: (p_0, v, \rho), \qquad p = p_0 + v / \rho \\
    \text{homogeneous} &: (v, \rho), \qquad p = v / \rho
 """
 
