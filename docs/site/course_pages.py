@@ -103,7 +103,8 @@ def table(all_items: list[Item], pages: dict[str, str]) -> str:
         "# Every item of the four documents\n",
         "Each section, equation, figure, table, program, exercise, slide and option of the",
         "[four documents](../learn.md), with its state here. *works*: kalmark does it, and the page shows it.",
-        "*partly*: a part of it, or no page shows it. *missing*: kalmark does not have it, or it has no page.\n",
+        "*partly*: a part of it, or no page shows it. *missing*: kalmark does not have it, or it has no page.",
+        "The figures of the documents are [beside ours](figures.md).\n",
         "| document | " + " | ".join(STATES) + " | items |\n|---|---|---|---|---|",
     ]
     for seed, title in [*SEEDS.items(), ("", "all")]:
