@@ -49,7 +49,8 @@ except km.KalmarkError as error:
 # ----------------------
 #
 # Dotted is the truth. Each control of the odometry adds its noise once, and the ellipses of 3 sigma grow slowly. The
-# noise of an impulse stays in the velocity, so the error of the position grows ever faster. The last line printed is the answer to an unknown motion.
+# noise of an impulse stays in the velocity, so the error of the position grows ever faster. The last line printed is
+# the answer to an unknown motion.
 
 # %%
 # Try changing
