@@ -33,6 +33,14 @@ class Observation(NamedTuple):
     """One observation's fate: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance.
 
     `shares` are the landmarks over which a soft association averaged, each with its weight, the likeliest first.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> slam = km.Slam(rover)
+    >>> reports = [slam.process(event) for event in events]
+    >>> reports[-1].observations[0][:4]
+    (0, 7, 'new', 7)
     """
 
     index: int  # type: ignore[assignment]  # of the observation in its scan; hides tuple.index
@@ -103,6 +111,10 @@ class Gap(NamedTuple):
     """A time without controls of a robot, so far: `kind` is "increments" (lost) or "held" (a velocity for too long).
 
     The standard deviations are those of each coordinate and each angle that the pose was given for it.
+
+    >>> gap = Gap("rover", "held", start_ns=2_000_000_000, end_ns=5_500_000_000, sigma_m=0.4, sigma_rad=0.1)
+    >>> gap.lasts_s
+    3.5
     """
 
     robot: str
@@ -148,6 +160,16 @@ class Expectations:
     whether it is in the map or not, and in the parameters of the sensor that are in the map (none: 0 columns).  E_l
     (L, p, n) is the Jacobian in the landmark.  Of a sensor that measures its velocity E_s is NaN.  All are padded with
     NaN where landmarks differ in size, and NaN of what cannot be expected.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> slam = km.Slam(rover)
+    >>> reports = [slam.process(event) for event in events]
+    >>> expected = slam.expect("rover", "lidar")
+    >>> expected.names, expected.e.round(2), expected.in_view
+    ((7, 8), array([[ 4. ,  0.3],
+           [ 2. , -1. ]]), array([ True,  True]))
     """
 
     robot: str
@@ -307,6 +329,14 @@ class LandmarkTable:
 
     `log_odds` are those that a landmark exists, of the landmarks that were looked at again; `unseen` are those that are
     not seen again where they should be (docs/association.md).
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> slam = km.Slam(rover)
+    >>> reports = [slam.process(event) for event in events]
+    >>> slam.landmarks().ids, [len(one.mean) for one in slam.landmarks()]
+    ([7, 8], [2, 2])
     """
 
     ids: list[Id]

@@ -209,6 +209,12 @@ class Campaign:
 
     `kind` is "world", or "config" of a log's replay; `description` is it as it was in force, in YAML.  Averages of NEES
     leave out the first `skip` steps.  `path` is the way by which the runs were computed: `running.path_of`.
+
+    >>> from kalmark.simulate import load_world
+    >>> world = load_world("cloister", ["steps=10"])
+    >>> campaign = run_campaign(world, 2, ["ekf", "invariant"], jobs=1, progress=False)
+    >>> campaign.label("pose"), campaign.summary()["estimators"]["ekf"]["diverged"]
+    ('pose (3)', 0)
     """
 
     world: str

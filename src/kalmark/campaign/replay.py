@@ -196,7 +196,15 @@ def _followed(slam: Slam, events: Iterable[Event | Look], config: Config) -> lis
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """A configuration and its log, to be simulated again and again."""
+    """A configuration and its log, to be simulated again and again.
+
+    >>> from kalmark.campaign.replay import replay_of
+    >>> from kalmark.simulate import load_world, simulate
+    >>> world = load_world("cloister", ["steps=10"])
+    >>> replay = replay_of(world.config(), simulate(world), progress=False)
+    >>> replay.robots, len(replay.times())
+    (('robot',), 10)
+    """
 
     name: str
     settings: Config

@@ -123,6 +123,12 @@ def run_campaign(
     Landmarks and joint state are scored every `map_every` steps; averages of NEES leave out the first `skip` steps.
     `address` is that of a dask or ray cluster.  Finished runs are kept in `folder`, if given, and are not run again
     unless `resume` is False.  Raises ConfigError, LogError or KalmarkError on anything that cannot be run.
+
+    >>> from kalmark.simulate import load_world
+    >>> world = load_world("cloister", ["steps=10"])
+    >>> campaign = run_campaign(world, 2, ["ekf"], jobs=1, progress=False)
+    >>> [*campaign.scores], len(campaign.scores["ekf"]), len(campaign.t_s)
+    (['ekf'], 2, 10)
     """
     scene = world if isinstance(world, World | Replay) else open_scene(world, progress=progress, estimators=estimators)
     sweep = run_sweep(
@@ -145,7 +151,12 @@ def run_sweep(
     folder: str | Path | None = None,
     resume: bool = True,
 ) -> Sweep:
-    """Run each of the cells (`open_cells`) as `run_campaign` does, all with the same seeds."""
+    """Run each of the cells (`open_cells`) as `run_campaign` does, all with the same seeds.
+
+    >>> sweep = run_sweep(open_cells("cloister", ["steps=5,10"], progress=False), 1, ["ekf"], jobs=1, progress=False)
+    >>> [(cell.label, len(campaign.t_s)) for cell, campaign in zip(sweep.cells, sweep.campaigns)]
+    [('steps=5', 5), ('steps=10', 10)]
+    """
     limits = (("runs", runs, 1), ("seed", seed, 0), ("map_every", map_every, 1), ("jobs", jobs, 1), ("skip", skip, 0))
     for name, value, least in limits:
         if value is not None and (not isinstance(value, int) or value < least):

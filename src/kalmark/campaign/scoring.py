@@ -173,6 +173,12 @@ class Scores:
     orientation (1, 3), the whole state if it has more than a pose, landmarks (the mean over the map), joint state,
     and the robot's uncertain mounts (the mean), each with its degrees of freedom `..._dof`; NaN where there is
     no score.
+
+    >>> from kalmark.simulate import load_world
+    >>> world = load_world("cloister", ["steps=10"])
+    >>> scores = run_campaign(world, 1, ["ekf"], jobs=1, progress=False).scores["ekf"][0]
+    >>> scores.series["pose"].shape, float(scores.series["pose_dof"][0, -1]), scores.diverged
+    ((1, 10), 3.0, False)
     """
 
     series: dict[str, Array]

@@ -65,7 +65,12 @@ def figure_over_runs(key: str, values: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The cells of a campaign and what each gave; run i of every cell has the same seed.  One cell without a sweep."""
+    """The cells of a campaign and what each gave; run i of every cell has the same seed.  One cell without a sweep.
+
+    >>> sweep = run_sweep(open_cells("cloister", ["steps=5,10"], progress=False), 1, ["ekf"], jobs=1, progress=False)
+    >>> sweep.keys, [row["steps"] for row in sweep.runs()]
+    (('steps',), [5, 10])
+    """
 
     cells: tuple[Cell, ...]
     campaigns: tuple[Campaign, ...]

@@ -24,7 +24,11 @@ Scene = World | Replay
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """A scene, and the values of the swept keys that are set in it."""
+    """A scene, and the values of the swept keys that are set in it.
+
+    >>> [cell.label for cell in open_cells("cloister", ["steps=5,10"])]
+    ['steps=5', 'steps=10']
+    """
 
     settings: dict[str, Any]
     scene: Scene
@@ -47,6 +51,9 @@ def open_scene(
     """Return the world, or the replay of the configuration, at a path or of a shipped name; of both, the world.
 
     `log` is the log to use instead of the configuration's.  Raises ConfigError, LogError, KalmarkError.
+
+    >>> len(open_scene("cloister", ["steps=10"]).times())
+    10
     """
     found = _found(path_or_name, overrides, log)
     refuse_unknown(estimators)
@@ -65,6 +72,10 @@ def open_cells(
 
     A sweep is "key.path=value,value"; values are YAML.  All cells are read before anything is simulated.
     Raises ConfigError on a key or value that the file cannot have.
+
+    >>> cells = open_cells("cloister", ["steps=5,10", "filter.estimator.type=ekf,fej"])
+    >>> len(cells), cells[0].settings
+    (4, {'steps': 5, 'filter.estimator.type': 'ekf'})
     """
     grid: dict[str, list[Any]] = {}
     for text in sweeps:

@@ -71,6 +71,10 @@ class Cause:
 
     `score` is the logarithm of the likelihood ratio against a run without it.  A noise that is stated too large is
     `harmless`: the map is as good as it would be, and better than it claims.
+
+    >>> cause = Cause("range_scale", since_s=0.0, score=41.0, evidence="ranges are 4 % too long", cure="scale: 1.04")
+    >>> f"{cause.evidence}; cure: {cause.cure}"
+    'ranges are 4 % too long; cure: scale: 1.04'
     """
 
     name: str
@@ -90,6 +94,11 @@ class Verdict:
     after it in the world and `shape_accuracy_m` that without the motion of the world that the start leaves open
     (`kalmark.results.gauge`), all the median over landmarks; `shift_m` is by how much the shape of the map changes
     without the causes.  `checked` names the data behind all this, `search` has the details.
+
+    >>> from kalmark.diagnosis.verdict import Cause
+    >>> verdict = Verdict("doubtful", (Cause("range_scale", 0.0, 41.0, "ranges too long"),), checked="900 ranges")
+    >>> verdict.as_dict()["map"], [cause["name"] for cause in verdict.as_dict()["causes"]]
+    ('doubtful', ['range_scale'])
     """
 
     map: str
@@ -114,6 +123,15 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
 
     It reads the log without its truth (`blind`).  With `progress`, standard error shows a bar.  Raises
     KalmarkError if the log of the run cannot be read again.
+
+    >>> from kalmark.config import build_slam
+    >>> from kalmark.simulate import load_world, simulate
+    >>> world = load_world("cloister", ["steps=60"])
+    >>> log = simulate(world)
+    >>> run = km.record(build_slam(world.config(), log), log, progress=False)
+    >>> verdict = diagnose(run)
+    >>> verdict.map, [cause.name for cause in verdict.causes if not cause.harmless]
+    ('ok', [])
     """
     run.run_plugins()
     seen, log = blind(run)
@@ -622,7 +640,11 @@ def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
 # ------------------------------------------------------------------ what they do to the map
 @dataclass(frozen=True)
 class Effect:
-    """Effect of the causes on a map: as in `Verdict`; `claimed` is the filter's sigma over what the data allow."""
+    """Effect of the causes on a map: as in `Verdict`; `claimed` is the filter's sigma over what the data allow.
+
+    >>> Effect().status, Effect(sigma_factor=1.3).sigma_factor
+    ('ok', 1.3)
+    """
 
     status: str = OK
     sigma_factor: float | None = None

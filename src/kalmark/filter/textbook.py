@@ -214,6 +214,14 @@ class Textbook:
 
     Each step is done by `TextbookSlam` with the configured motion and sensor: range and bearing to points of the plane
     with known ids, by one robot.  Fixes, and landmarks known exactly, are fused by `Ekf`.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> slam = km.Slam(rover, estimator=Textbook())
+    >>> reports = [slam.process(event) for event in events]
+    >>> slam.mean("rover").round(3), slam.mean(7).round(2)
+    (array([0.05, 0.  , 0.01]), array([3.86, 1.22]))
     """
 
     show: Annotated[bool, "Print the result of each equation."] = False

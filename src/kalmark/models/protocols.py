@@ -45,12 +45,24 @@ class _Remembered(type(Protocol)):  # type: ignore[misc]
 
 
 class Capability(Protocol, metaclass=_Remembered):
-    """Optional attributes and methods of a model."""
+    """Optional attributes and methods of a model.
+
+    >>> isinstance(km.sensors.RangeBearing(), Visible), isinstance(km.sensors.Heading(), Visible)
+    (True, False)
+    """
 
 
 @runtime_checkable
 class Motion(Capability, Protocol):
-    """The motion of a robot.  [S] (1), (14)-(17)."""
+    """The motion of a robot.  [S] (1), (14)-(17).
+
+    >>> rover = km.motion.Unicycle(sigma_v_mps=0.1, sigma_w_radps=0.2)
+    >>> isinstance(rover, Motion), rover.columns, rover.held
+    (True, ('v_mps', 'w_radps'), True)
+    >>> rover.move(np.zeros(3), np.array([1.0, 0.0]), 2.0)[0], rover.control_noise(np.array([1.0, 0.0])).round(3)
+    (array([2., 0., 0.]), array([[0.01, 0.  ],
+           [0.  , 0.04]]))
+    """
 
     @property
     def space(self) -> Space:
@@ -79,7 +91,14 @@ class Motion(Capability, Protocol):
 
 @runtime_checkable
 class Sensor(Capability, Protocol):
-    """The measurement of a landmark at v in the frame of the sensor.  [S] (2), (18)."""
+    """The measurement of a landmark at v in the frame of the sensor.  [S] (2), (18).
+
+    >>> lidar = km.sensors.RangeBearing(sigma_range_m=0.1, sigma_bearing_rad=0.02, range_max_m=10.0, fov_rad=3.14)
+    >>> isinstance(lidar, Sensor), lidar.columns, lidar.angular
+    (True, ('range_m', 'bearing_rad'), (False, True))
+    >>> lidar.expect(np.array([[3.0, 4.0]]))[0].round(3)
+    array([[5.   , 0.927]])
+    """
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -98,7 +117,14 @@ class Sensor(Capability, Protocol):
 
 @runtime_checkable
 class FullSensor(Sensor, Protocol):
-    """A sensor that measures everything a landmark has, so that it can start one.  [S] (3)."""
+    """A sensor that measures everything a landmark has, so that it can start one.  [S] (3).
+
+    >>> lidar = km.sensors.RangeBearing(sigma_range_m=0.1, sigma_bearing_rad=0.02, range_max_m=10.0, fov_rad=3.14)
+    >>> lidar.invert(np.array([[5.0, 0.0]]))[0]
+    array([[5., 0.]])
+    >>> isinstance(lidar, FullSensor), isinstance(km.sensors.Heading(), FullSensor)
+    (True, False)
+    """
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return what is at v (K, d) in the sensor's frame when y (K, m) is measured, and V_y (K, d, m)."""
@@ -110,6 +136,11 @@ class NonAdditiveSensor(Sensor, Protocol):
 
     The noise must not be taken at the measured values: of a range noise that grows with the range, this weights the
     short ranges more and biases every landmark towards the sensor.
+
+    >>> lidar = km.sensors.RangeBearing(sigma_range_m=0.1, sigma_bearing_rad=0.02, sigma_range_rel=0.05)
+    >>> lidar.additive, lidar.noise_at(np.array([[10.0, 0.0]])).round(4)
+    (False, array([[[0.26  , 0.    ],
+            [0.    , 0.0004]]]))
     """
 
     @property
@@ -122,7 +153,14 @@ class NonAdditiveSensor(Sensor, Protocol):
 
 @runtime_checkable
 class Landmark(Capability, Protocol):
-    """The view of a landmark from a pose: v, the landmark in the frame T of the sensor."""
+    """The view of a landmark from a pose: v, the landmark in the frame T of the sensor.
+
+    >>> point = km.landmarks.Point2D()
+    >>> isinstance(point, Landmark), point.kind
+    (True, 'point')
+    >>> point.seen_from(np.array([1.0, 0.0, np.pi / 2]), np.array([[1.0, 2.0]]))[0].round(3)
+    array([[2., 0.]])
+    """
 
     @property
     def kind(self) -> str:
@@ -182,7 +220,13 @@ class _Coasts(Capability, Protocol):
 
 @runtime_checkable
 class SelfCalibrating(Capability, Protocol):
-    """A motion of which constants may be in the map, and estimated."""
+    """A motion of which constants may be in the map, and estimated.
+
+    >>> rover = km.motion.Unicycle(sigma_v_bias_mps=0.05)
+    >>> rover.calibration, rover.calibration_cov, rover.calibration_effect(np.array([1.0, 0.0]), 0.1)
+    (('v_mps',), array([[0.0025]]), array([[1.],
+           [0.]]))
+    """
 
     @property
     def calibration(self) -> tuple[str, ...]:
@@ -198,7 +242,11 @@ class SelfCalibrating(Capability, Protocol):
 
 @runtime_checkable
 class NonlinearCalibration(SelfCalibrating, Protocol):
-    """A motion of which the constants in the map do not change a control by B a."""
+    """A motion of which the constants in the map do not change a control by B a.
+
+    >>> [isinstance(one, NonlinearCalibration) for one in (km.motion.DifferentialDrive(), km.motion.Unicycle())]
+    [True, False]
+    """
 
     def calibrated(self, u: Array, a: Array, dt_s: float) -> tuple[Array, Array]:
         """Return the control (m,) that u (m,) is in truth with the constants a (c,), and U_a (m, c)."""
@@ -206,7 +254,11 @@ class NonlinearCalibration(SelfCalibrating, Protocol):
 
 @runtime_checkable
 class StateDiffusion(Capability, Protocol):
-    """A motion of which the diffusion depends on its state, such as a velocity in it."""
+    """A motion of which the diffusion depends on its state, such as a velocity in it.
+
+    >>> isinstance(km.motion.Inertial(), StateDiffusion), isinstance(km.motion.Unicycle(), StateDiffusion)
+    (True, False)
+    """
 
     def diffusion_at(self, r: Array, u: Array, dt_s: float) -> Array | None:
         """Return what `diffusion` does, from the state r (size,) on."""
@@ -219,7 +271,12 @@ class _StateColumns(Capability, Protocol):
 
 @runtime_checkable
 class HasVelocity(Capability, Protocol):
-    """A motion whose state contains the velocity of the robot."""
+    """A motion whose state contains the velocity of the robot.
+
+    >>> motion = km.motion.ConstantVelocity()
+    >>> motion.body_velocity(np.array([0.0, 0.0, np.pi / 2, 2.0, 0.0, 0.1]))[0].round(3)
+    array([2. , 0. , 0.1])
+    """
 
     def body_velocity(self, r: Array) -> tuple[Array, Array]:
         """Return the velocity of a state r (size,) in the robot's frame, and its Jacobian (3 or 6, dof).
@@ -230,7 +287,11 @@ class HasVelocity(Capability, Protocol):
 
 @runtime_checkable
 class HoldsRate(Capability, Protocol):
-    """A motion of which the state has the velocity, and the control in force the turn rate: an inertial unit."""
+    """A motion of which the state has the velocity, and the control in force the turn rate: an inertial unit.
+
+    >>> isinstance(km.motion.Inertial(), HoldsRate), isinstance(km.motion.Unicycle(), HoldsRate)
+    (True, False)
+    """
 
     columns: tuple[str, ...]
 
@@ -355,7 +416,12 @@ def innovation_size(sensor: Sensor) -> int:
 # ------------------------------------------------------------------ capabilities of sensors
 @runtime_checkable
 class Visible(Capability, Protocol):
-    """A sensor with a limited field of view."""
+    """A sensor with a limited field of view.
+
+    >>> lidar = km.sensors.RangeBearing(sigma_range_m=0.1, sigma_bearing_rad=0.02, range_max_m=10.0, fov_rad=3.14)
+    >>> lidar.sees(np.array([[5.0, 0.0], [-5.0, 0.0], [20.0, 0.0]]))
+    array([ True, False, False])
+    """
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d), in the sensor's frame, can be measured."""
@@ -363,7 +429,11 @@ class Visible(Capability, Protocol):
 
 @runtime_checkable
 class SegmentVisible(Capability, Protocol):
-    """A sensor that measures parts of line segments."""
+    """A sensor that measures parts of line segments.
+
+    >>> isinstance(km.sensors.Wall(), SegmentVisible), isinstance(km.sensors.RangeBearing(), SegmentVisible)
+    (True, False)
+    """
 
     def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
         """Return which segments from p1 to p2 (K, 2 or 3) of the world are seen from T, and what is measured."""
@@ -371,7 +441,11 @@ class SegmentVisible(Capability, Protocol):
 
 @runtime_checkable
 class Parametrized(Capability, Protocol):
-    """A sensor with parameters of its own, which its compiled expectation takes."""
+    """A sensor with parameters of its own, which its compiled expectation takes.
+
+    >>> km.sensors.RangeBearing(scale=1.02, bias_m=0.1).parameters
+    array([0.98039216, 0.09803922])
+    """
 
     @property
     def parameters(self) -> Array:
@@ -380,7 +454,13 @@ class Parametrized(Capability, Protocol):
 
 @runtime_checkable
 class Calibrated(Parametrized, Protocol):
-    """A sensor whose own parameters may be in the map, and estimated."""
+    """A sensor whose own parameters may be in the map, and estimated.
+
+    >>> lidar = km.sensors.RangeBearing(sigma_scale=0.02)
+    >>> lidar.parameter_cov, km.sensors.RangeBearing().parameter_cov is None
+    (array([[0.0004, 0.    ],
+           [0.    , 0.    ]]), True)
+    """
 
     @property
     def parameter_cov(self) -> Array | None:
@@ -398,6 +478,9 @@ class SeesVelocity(Capability, Protocol):
     """A sensor of landmarks that stand still, whose measurements depend on its own velocity, too.
 
     Its v (K, 2 d) are points and, behind them, the velocity of the sensor, both in its frame (`velocity_view.py`).
+
+    >>> isinstance(km.sensors.Radar2D(), SeesVelocity), isinstance(km.sensors.RangeBearing(), SeesVelocity)
+    (True, False)
     """
 
     sees_velocity: bool
@@ -408,7 +491,11 @@ POSE, CHANGE, TWIST = "pose", "change", "twist"  # the views of a sensor of the 
 
 @runtime_checkable
 class OfState(Sensor, Protocol):
-    """A sensor that measures its own robot: `views` is POSE, CHANGE or TWIST."""
+    """A sensor that measures its own robot: `views` is POSE, CHANGE or TWIST.
+
+    >>> km.sensors.Heading().views, km.sensors.Odometer2D().views, km.sensors.Gyro2D().views
+    ('pose', 'change', 'twist')
+    """
 
     views: str
     pass_share: float
@@ -427,7 +514,11 @@ def poses_kept(sensor: OfState) -> int:
 
 @runtime_checkable
 class TimedNoise(Capability, Protocol):
-    """A sensor of the state whose noise depends on how long a reading means."""
+    """A sensor of the state whose noise depends on how long a reading means.
+
+    >>> isinstance(km.sensors.Gyro2D(), TimedNoise), isinstance(km.sensors.RangeBearing(), TimedNoise)
+    (True, False)
+    """
 
     def noise_since(self, dt_s: float) -> Array:
         """Return the noise R (1, p, p) of a reading that means the last `dt_s` seconds."""
@@ -435,7 +526,11 @@ class TimedNoise(Capability, Protocol):
 
 @runtime_checkable
 class Drifting(Capability, Protocol):
-    """A sensor whose parameters walk at random."""
+    """A sensor whose parameters walk at random.
+
+    >>> isinstance(km.sensors.Gyro2D(), Drifting), isinstance(km.sensors.RangeBearing(), Drifting)
+    (True, False)
+    """
 
     def drift(self, dt_s: float) -> Array:
         """Return the variances (p,) that its parameters gather in `dt_s`."""
@@ -443,7 +538,11 @@ class Drifting(Capability, Protocol):
 
 @runtime_checkable
 class Distant(Capability, Protocol):
-    """A sensor each of whose measurements determines a distance: a range, or a received signal strength."""
+    """A sensor each of whose measurements determines a distance: a range, or a received signal strength.
+
+    >>> km.sensors.RangeBearing().distances(np.array([[5.0, 0.3]]))
+    array([5.])
+    """
 
     def distances(self, y: Array) -> Array:
         """Return the distances (K,) in m of measurements y (K, m); in the plane, those along the plane."""
@@ -456,7 +555,11 @@ def distances_alone(sensor: Sensor) -> bool:
 
 @runtime_checkable
 class Ranging(Distant, Protocol):
-    """A sensor whose first component is a range."""
+    """A sensor whose first component is a range.
+
+    >>> km.sensors.Range(sigma_range_m=0.2).range_variance(np.array([[5.0]])).round(3)
+    array([0.04])
+    """
 
     def range_variance(self, y: Array) -> Array:
         """Return the variances (K,) of the ranges of measurements y (K, m), m^2."""
@@ -464,7 +567,12 @@ class Ranging(Distant, Protocol):
 
 @runtime_checkable
 class Intersecting(Capability, Protocol):
-    """A sensor of which two measurements, from two poses, determine a point."""
+    """A sensor of which two measurements, from two poses, determine a point.
+
+    >>> here, there = np.array([[np.pi / 4]]), np.array([[3 * np.pi / 4]])
+    >>> km.sensors.Bearing().meet(np.array([2.0, 0.0, 0.0]), here, there)[0].round(3)
+    array([[1., 1.]])
+    """
 
     def meet(self, T: Array, y: Array, y2: Array) -> Array:
         """Return the points (K, c, d) that explain y (K, m) from the origin and y2 (K, m) from T, NaN where none."""
@@ -472,7 +580,11 @@ class Intersecting(Capability, Protocol):
 
 @runtime_checkable
 class Ambiguous(Capability, Protocol):
-    """A sensor of which one measurement fits two poses: planar pose ambiguity, Schweighofer and Pinz 2006."""
+    """A sensor of which one measurement fits two poses: planar pose ambiguity, Schweighofer and Pinz 2006.
+
+    >>> isinstance(km.sensors.TagCorners(), Ambiguous), isinstance(km.sensors.TagPose(), Ambiguous)
+    (True, False)
+    """
 
     def both(self, y: Array) -> tuple[Array, Array, Array]:
         """Return both poses (K, 2, 7) that explain y (K, m), the better first, V_y (K, 2, 6, p), chi-squares (K, 2)."""
@@ -480,7 +592,11 @@ class Ambiguous(Capability, Protocol):
 
 @runtime_checkable
 class FarCorrected(Capability, Protocol):
-    """A sensor whose measurements far from the expected ones are first corrected as poses."""
+    """A sensor whose measurements far from the expected ones are first corrected as poses.
+
+    >>> isinstance(km.sensors.TagCorners(), FarCorrected), isinstance(km.sensors.PinHole(), FarCorrected)
+    (True, False)
+    """
 
     def is_far(self, y: Array, z: Array) -> Flags:
         """Return which measurements y (K, m) are far from the expected ones by their innovations z (K, p)."""
@@ -491,7 +607,11 @@ class FarCorrected(Capability, Protocol):
 
 @runtime_checkable
 class OwnNoise(Capability, Protocol):
-    """A sensor whose innovations are something else than its measurements, so that a scan's covariance is converted."""
+    """A sensor whose innovations are something else than its measurements, so that a scan's covariance is converted.
+
+    >>> isinstance(km.sensors.Segments(), OwnNoise), isinstance(km.sensors.RangeBearing(), OwnNoise)
+    (True, False)
+    """
 
     def noise_from(self, y: Array, cov: Array) -> Array:
         """Return the noise (K, p, p) of the innovations, of the covariances (K, m, m) of measurements y (K, m)."""
@@ -499,7 +619,11 @@ class OwnNoise(Capability, Protocol):
 
 @runtime_checkable
 class StartNoise(Capability, Protocol):
-    """A sensor whose noise when a landmark starts is another one than in a correction."""
+    """A sensor whose noise when a landmark starts is another one than in a correction.
+
+    >>> isinstance(km.sensors.Segments(), StartNoise), isinstance(km.sensors.RangeBearing(), StartNoise)
+    (True, False)
+    """
 
     def start_noise(self, y: Array) -> Array:
         """Return the noise (K, m, m) of the measurements y (K, m) themselves."""
@@ -507,7 +631,14 @@ class StartNoise(Capability, Protocol):
 
 @runtime_checkable
 class Checked(Capability, Protocol):
-    """A sensor that cannot have made every measurement of the right shape."""
+    """A sensor that cannot have made every measurement of the right shape.
+
+    >>> try:
+    ...     km.sensors.RangeBearing().check(np.array([[-1.0, 0.0]]))
+    ... except km.KalmarkError as error:
+    ...     print(error)
+    observation 0: range is -1.0 m, expected at least 0
+    """
 
     def check(self, y: Array) -> None:
         """Raise EventError if this sensor cannot have made the measurements y (K, m)."""
@@ -516,14 +647,22 @@ class Checked(Capability, Protocol):
 # ------------------------------------------------------------------ capabilities of landmarks
 @runtime_checkable
 class UnknownDepth(Capability, Protocol):
-    """A landmark that starts at a prior inverse distance where the sensor finds no depth."""
+    """A landmark that starts at a prior inverse distance where the sensor finds no depth.
+
+    >>> km.landmarks.InverseDepth2D().prior_rho_per_m
+    0.5
+    """
 
     prior_rho_per_m: float
 
 
 @runtime_checkable
 class Completing(Capability, Protocol):
-    """A landmark that supplies what a measurement does not determine of it."""
+    """A landmark that supplies what a measurement does not determine of it.
+
+    >>> isinstance(km.landmarks.InverseDepth2D(), Completing), isinstance(km.landmarks.Point2D(), Completing)
+    (True, False)
+    """
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, Array | None]:
         """Return what `from_view` takes (K, e) for a sensor's v (K, d), its Jacobian in y, and the prior (K, e, e)."""
@@ -531,7 +670,12 @@ class Completing(Capability, Protocol):
 
 @runtime_checkable
 class Pointed(Capability, Protocol):
-    """A landmark that is one point."""
+    """A landmark that is one point.
+
+    >>> ray = km.landmarks.InverseDepth2D()
+    >>> ray.to_point(np.array([[1.0, 0.0, 0.0, 0.5]]))[0]
+    array([[3., 0.]])
+    """
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the points p (K, 2 or 3) of landmarks l (K, n), m, and P_l (K, 2 or 3, n)."""
@@ -539,7 +683,11 @@ class Pointed(Capability, Protocol):
 
 @runtime_checkable
 class Reparametrizable(Pointed, Protocol):
-    """A landmark that becomes a Euclidean point once that is as good.  Civera, Davison and Montiel 2008."""
+    """A landmark that becomes a Euclidean point once that is as good.  Civera, Davison and Montiel 2008.
+
+    >>> [isinstance(one, Reparametrizable) for one in (km.landmarks.InverseDepth2D(), km.landmarks.Point2D())]
+    [True, False]
+    """
 
     def linearity(self, T: Array, l: Array, sigmas: Array) -> Array:
         """Return the linearity indices (K,) of landmarks l (K, n) with `sigmas` (K, n), seen from the pose T."""
@@ -547,7 +695,11 @@ class Reparametrizable(Pointed, Protocol):
 
 @runtime_checkable
 class Segmented(Capability, Protocol):
-    """A line, of which a segment from abscissa to abscissa is kept."""
+    """A line, of which a segment from abscissa to abscissa is kept.
+
+    >>> isinstance(km.landmarks.Wall2D(), Segmented), isinstance(km.landmarks.Point2D(), Segmented)
+    (True, False)
+    """
 
     first_ends: tuple[float, float]
     extend: bool
@@ -564,7 +716,11 @@ class Segmented(Capability, Protocol):
 
 @runtime_checkable
 class Joining(Segmented, Protocol):
-    """A line of the plane of which segments that join are one landmark, and others are others."""
+    """A line of the plane of which segments that join are one landmark, and others are others.
+
+    >>> isinstance(km.landmarks.Wall2D(), Joining), isinstance(km.landmarks.PlueckerLine(), Joining)
+    (True, False)
+    """
 
     join_m: float
 
@@ -574,7 +730,11 @@ class Joining(Segmented, Protocol):
 
 @runtime_checkable
 class HasPlace(Capability, Protocol):
-    """A landmark that is somewhere."""
+    """A landmark that is somewhere.
+
+    >>> km.landmarks.Point2D().place(np.array([[1.0, 2.0]]))[0]
+    array([[1., 2.]])
+    """
 
     def place(self, l: Array) -> tuple[Array, Array]:
         """Return where landmarks l (K, n) are in the world, p (K, 2 or 3) in m, and P_l (K, 2 or 3, n)."""

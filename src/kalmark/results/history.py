@@ -38,7 +38,15 @@ TYPES: dict[Any, Any] = {int: np.int64, bool: np.bool_, float: np.float64, str: 
 
 
 class Controlled(NamedTuple):
-    """A robot's controls: how many, parts of an increment as one, and the times (ns) of the first and the last."""
+    """A robot's controls: how many, parts of an increment as one, and the times (ns) of the first and the last.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> run = km.record(km.Slam(rover), events, progress=False)
+    >>> run.history.controls["rover"]
+    Controlled(number=1, first_ns=0, last_ns=0)
+    """
 
     number: float
     first_ns: int
@@ -49,6 +57,12 @@ class UsedFix(NamedTuple):
     """A fix that the filter was given: y (d,), innovation z (d,) and its covariance Z (d, d), d = 2 or 3.
 
     `used`: not rejected.  `moved_m` is how far the robot was moved, as the last fixes agreed that it was elsewhere.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), cov=np.eye(3))
+    >>> fix = km.Fix(t_s=0.1, robot="rover", y=(0.2, -0.1), cov=np.eye(2))
+    >>> run = km.record(km.Slam(rover), [fix], progress=False)
+    >>> run.history.fixes[0].used, run.history.fixes[0].z.round(2)
+    (True, array([ 0.2, -0.1]))
     """
 
     t_ns: int
@@ -64,6 +78,10 @@ class RelocatedRobot(NamedTuple):
     """A robot that readings of a sensor placed elsewhere, as the last ones agreed on it: how far, m.
 
     `before` are the readings of that sensor that the filter used until then.
+
+    >>> moved = RelocatedRobot(t_ns=12_000_000_000, robot="rover", sensor="receiver", moved_m=4.2, before=17)
+    >>> f"{moved.robot} moved by {moved.moved_m} m at {moved.t_ns * 1e-9:g} s, after {moved.before} readings"
+    'rover moved by 4.2 m at 12 s, after 17 readings'
     """
 
     t_ns: int
@@ -74,7 +92,12 @@ class RelocatedRobot(NamedTuple):
 
 
 class LandmarkChange(NamedTuple):
-    """The end of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now."""
+    """The end of a landmark after the scan of a step: it was "removed", or "merged" with the one it is now.
+
+    >>> change = LandmarkChange(step=40, landmark="17", what="merged", into="3", reason="d2 1.2")
+    >>> f"{change.landmark} {change.what} into {change.into} after step {change.step}"
+    '17 merged into 3 after step 40'
+    """
 
     step: int
     landmark: str
@@ -84,7 +107,15 @@ class LandmarkChange(NamedTuple):
 
 
 class RobotStart(NamedTuple):
-    """A robot before the first event: its name, mean and covariance, and the time of its first event."""
+    """A robot before the first event: its name, mean and covariance, and the time of its first event.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> run = km.record(km.Slam(rover), events, progress=False)
+    >>> run.history.starts[0].robot, run.history.starts[0].mean
+    ('rover', array([0., 0., 0.]))
+    """
 
     robot: str
     mean: Vector
@@ -93,7 +124,17 @@ class RobotStart(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """A landmark of a survey: its name, and its mean and covariance (0: known exactly) before the first event."""
+    """A landmark of a survey: its name, and its mean and covariance (0: known exactly) before the first event.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> slam = km.Slam(rover)
+    >>> slam.add_landmark(7, mean=(4.0, 1.0), cov=0.01 * np.eye(2))
+    >>> run = km.record(slam, events, progress=False)
+    >>> [(prior.landmark, prior.mean, float(prior.covariance[0, 0])) for prior in run.history.priors]
+    [('7', array([4., 1.]), 0.01)]
+    """
 
     landmark: str
     mean: Vector
@@ -107,6 +148,14 @@ class MapSnapshot(NamedTuple):
     NaN (see `kalmark.results.landmark_table`).  `shape` (K, q, q) are the
     covariances without the motion of the world in common (`kalmark.results.gauge`), `robots` (R, d, d) those of the
     robots' positions, in the order of their starts.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> run = km.record(km.Slam(rover), events, progress=False)
+    >>> last = run.history.maps[-1]
+    >>> last.ids, last.means.shape, last.covariances.shape, last.kinds
+    ((7, 8), (2, 2), (2, 2, 2), ('point', 'point'))
     """
 
     step: int
@@ -123,6 +172,12 @@ class Camera(NamedTuple):
     """A camera of a robot: its mount (7,), the image's width and height in pixels, and what its rows of y are.
 
     `corners` (4, 3) are the rays to the image's corners with z = 1, for drawing.
+
+    >>> eye = km.Mount(km.sensors.PinHole(), at=(0, 0, 0, 0, 0, 0, 1))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> run = km.record(slam, [km.Scan(0.0, "drone", "eye", [[320.0, 240.0]], ids=[1])], progress=False)
+    >>> run.history.cameras[0].size, run.history.cameras[0].columns
+    ((640.0, 480.0), ('u_px', 'v_px'))
     """
 
     robot: str
@@ -134,7 +189,15 @@ class Camera(NamedTuple):
 
 
 class Measuring(NamedTuple):
-    """A sensor of a robot that is no camera, and what its rows of y are."""
+    """A sensor of a robot that is no camera, and what its rows of y are.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> run = km.record(km.Slam(rover), events, progress=False)
+    >>> run.history.sensors
+    (Measuring(robot='rover', sensor='lidar', columns=('range_m', 'bearing_rad')),)
+    """
 
     robot: str
     sensor: str
@@ -146,6 +209,12 @@ class CalibratedMount(NamedTuple):
 
     `covariance` at the end and `prior`, that before the first event, (3, 3) or (6, 6), are in the robot's frame.  The
     `constants` of the sensor itself follow where they are in the map, too.
+
+    >>> mount = km.Mount(km.sensors.RangeBearing(), at=(0.2, 0.0, 0.0), cov=np.diag([0.01, 0.01, 0.001]))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": mount}))
+    >>> run = km.record(slam, [km.Scan(0.1, "rover", "lidar", [[4.0, 0.3]], ids=[7])], progress=False)
+    >>> run.history.mounts[0].name, run.history.mounts[0].mean
+    ('rover.lidar', array([0.2, 0. , 0. ]))
     """
 
     name: str
@@ -156,7 +225,13 @@ class CalibratedMount(NamedTuple):
 
 
 class Biased(NamedTuple):
-    """The constants of a robot's controls at the end: their names `columns`, `mean` (c,) and covariance (c, c)."""
+    """The constants of a robot's controls at the end: their names `columns`, `mean` (c,) and covariance (c, c).
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(sigma_v_bias_mps=0.05))
+    >>> run = km.record(km.Slam(rover), [km.Control(t, "rover", (0.5, 0.1)) for t in (0.0, 0.1)], progress=False)
+    >>> run.history.biases[0].columns, run.history.biases[0].covariance.round(4)
+    (('v_mps',), array([[0.0025]]))
+    """
 
     robot: str
     columns: Names
@@ -169,6 +244,10 @@ class Repeated(NamedTuple):
 
     `shift` (2,) [m] and `turn_rad` move the older part of the map onto the newer one, in the middle of them; `score`
     is the log-likelihood ratio of all its pairs against chance, `p` how many such repeats are expected by chance.
+
+    >>> pair = Repeated(1, "3", "41", shift=np.array([0.4, -0.2]), turn_rad=0.02, score=35.0, p=1e-9)
+    >>> f"{pair.landmark} and {pair.other} seem to be one, {np.hypot(*pair.shift):.2f} m apart"
+    '3 and 41 seem to be one, 0.45 m apart'
     """
 
     number: int
@@ -226,6 +305,13 @@ class History:
     `changes` is what became of landmarks, `fixes` are those used, in the order they came, `controls` those of each
     robot that had any, `gaps` the times without, `repeats` pairs of landmarks that seem to be one.  `priors` are the
     landmarks that were surveyed.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
+    >>> events = [km.Control(0.0, "rover", (0.5, 0.1)), scan]
+    >>> run = km.record(km.Slam(rover), events, progress=False)
+    >>> run.history.poses.round(3), run.history.outcome.tolist(), run.history.y.shape
+    (array([[0.05, 0.  , 0.01]]), ['new', 'new'], (2, 2))
     """
 
     t_ns: Ints
