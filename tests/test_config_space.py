@@ -16,6 +16,7 @@ from kalmark.config import opening as opening_module
 from kalmark.errors import ConfigError
 from kalmark.logs import Log, Trajectory
 from kalmark.results.recording import config_yaml
+from kalmark.simulate import load_world
 
 SECOND = 1_000_000_000
 RADAR = {"type": "range_bearing_3d", "sigma_range_m": 0.3, "mount": {"z_m": 0.6, "yaw_deg": 90.0}}
@@ -237,3 +238,8 @@ def test_robots_of_the_plane_and_of_space_in_one_map_are_refused_by_their_place(
     log = dataclasses.replace(log_of("a", "b"), control_columns={})
     with pytest.raises(ConfigError, match=r"robots: robot 'b' is of the plane, expected one of the space"):
         build_slam(*opened("robots: {a: {}, b: {motion: {type: unicycle}}}", log))
+
+
+def test_an_unknown_motion_of_a_robot_of_space_is_the_error_not_its_start() -> None:
+    with pytest.raises(ConfigError, match=r"robots\.robot\.motion\.type: got 'hover', expected one of .*odometry_3d"):
+        load_world("thick_cloister", ["robots.robot.motion.type=hover"])

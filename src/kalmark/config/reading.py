@@ -111,7 +111,10 @@ def resolve_name(path_or_name: str | Path, shipped: dict[str, Path], what: str) 
 
 
 def validate(tree: Tree, model: type[Model]) -> Model:
-    """Return the tree as a `model`, or raise the first error in it, in file order, as one ConfigError."""
+    """Return the tree as a `model`, or raise the first error in it as one ConfigError.
+
+    An unknown type is the first: others may follow from it.  Else the order is that of the file.
+    """
     try:
         return model.model_validate(tree.values)
     except ValidationError as error:
@@ -120,7 +123,8 @@ def validate(tree: Tree, model: type[Model]) -> Model:
             ((*_path(e["loc"], tree.values), *e.get("ctx", {}).get("below", ())), e)
             for e in error.errors(include_url=False)
         ]
-        raise _one_error(*min(errors, key=lambda e: order.get(e[0], 0)), tree) from None
+        errors.sort(key=lambda e: (e[1]["type"] != "union_tag_invalid", order.get(e[0], 0)))
+        raise _one_error(*errors[0], tree) from None
 
 
 def did_you_mean(word: str, words: Sequence[str]) -> str:
