@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -16,7 +17,9 @@ import pytest
 
 import kalmark as km
 from command_line import Kalmark
+from kalmark import declare
 from kalmark.results.run import Run
+from kalmark.simulate import load_world
 
 WORLD = ("random_field", "--set", "steps=60")
 LINE = "        self.x = self.x + K @ z  # (22)\n"
@@ -84,6 +87,18 @@ def test_a_campaign_compares_the_textbook_and_a_changed_copy_with_the_ekf(kalmar
     assert [*found] == labels
     ekf, book, own = (found[label]["pose_anees"] for label in labels)
     assert book == pytest.approx(ekf, abs=1e-9) and abs(own - ekf) > 1e-3
+
+
+def test_a_worker_that_knows_no_class_of_the_user_yet_finds_it_by_its_file(
+    kalmark: Kalmark, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy_of_the_program(Path("sent.py"))
+    Path("world.yaml").write_text(kalmark("worlds", "random_field").out + "plugins: [sent.py]\n")
+    section = load_world("world.yaml", ["filter.estimator=sent:Textbook"]).config().estimator
+    sent = pickle.dumps(section)
+    known = {name: models for name, models in declare._CLASSES["estimator"].items() if name != "sent:Textbook"}
+    monkeypatch.setattr(declare, "_CLASSES", declare._CLASSES | {"estimator": known})
+    assert dict(pickle.loads(sent)) == dict(section) and "sent:Textbook" in declare._CLASSES["estimator"]
 
 
 def events_between_controls(steps: int) -> list[Any]:

@@ -288,5 +288,6 @@ def model_of(section: Any, world: str = "plane") -> Any:
 def _unpickled(role: str, name: str, world: str, plugin: Path | None) -> Section:
     if plugin is not None:
         load_plugin(plugin)
+        register_by_file(role, name)
     section = section_of(role, name, world)
     return section.__new__(section)
