@@ -180,6 +180,5 @@ def _fit(task: Task, judged: Judged, before: Judged) -> dict[str, float | None]:
 
 
 def _numbers(values: Array) -> list[list[float | None]]:
-    """Return rows of numbers (N, k), each to a tenth of a millimetre, or to its first digits if it is smaller."""
-    return [[None if not np.isfinite(v) else round(v, 4) if abs(v) > 0.1 else float(f"{v:.3g}") for v in row]
-            for row in values.tolist()]  # fmt: skip
+    """Return rows of numbers (N, k), each to six significant digits."""
+    return [round_significant(row, 6) for row in values]
