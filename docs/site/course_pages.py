@@ -80,7 +80,7 @@ def options(text: str) -> list[Item]:
         for line in body.splitlines():
             cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
             if len(cells) > 1 and cells[0] not in ("toolbox", "-") and not cells[0].startswith("---"):
-                state = {"not available": "missing", "partly": "partly"}
+                state = {"not available": "missing", "not done": "missing", "partly": "partly"}
                 shown = next((s for start, s in state.items() if cells[1].startswith(start)), "works")
                 found.append(Item("TB", f"Settings: {head}", cells[0], cells[1], shown, page, (), ""))
     return found
