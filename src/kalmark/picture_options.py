@@ -23,7 +23,7 @@ class Picture:
         Within(),
         "Box to draw: [x_min, x_max, y_min, y_max], in space with z_min, z_max; all of the map if absent.",
     ] = None
-    width_px: Annotated[Positive | None, "Width of the picture; by its content if absent."] = None
+    width_px: Annotated[float | None, Within(gt=0), "Width of the picture; by its content if absent."] = None
     ellipses: Annotated[
         Literal["shape", "world", "off"],
         "Ellipses of the shape of the map, in the world with the start's uncertainty, or none.",
@@ -45,6 +45,11 @@ class Picture:
             len(limits) not in (4, 6) or any(a >= b for a, b in zip(limits[::2], limits[1::2], strict=True))
         ):
             raise refuse(self, "limits_m", "4 or 6 numbers, each minimum below its maximum")
+        if self.colours:
+            from matplotlib.colors import is_color_like  # matplotlib is slow to import
+
+            if odd := [name for name, colour in self.colours.items() if not is_color_like(colour)]:
+                raise refuse(self, "colours", f"a colour of matplotlib for {odd[0]}: red, tab:blue, #1f5fa8, ...")
 
     def colour(self, what: str, usual: str) -> str:
         """Return the colour of a robot or of a kind of things, by default the usual one."""

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from matplotlib.image import imread
 
 from command_line import Kalmark, refused, write_log, write_log_of_space
 from kalmark.errors import PluginError
@@ -75,3 +76,16 @@ def test_the_page_of_a_run_is_opened(kalmark: Kalmark, runs: list[str], monkeypa
     assert refused(kalmark("view", "a", "--save", "a.rrd")) == "no viewer is installed"
     assert kalmark("view", "a", "--no-open").out == "a/report.html\n" and len(opened) == 2
     assert "none" in refused(kalmark("view", "none"))
+
+
+def test_a_run_is_drawn_again_with_other_options(kalmark: Kalmark, runs: list[str]) -> None:
+    before = Path("a/report.html").read_text()
+    assert kalmark("report", "a", "--set", "picture.width_px=400", "--set", "picture.sigmas=1").status == 0
+    assert imread("a/map.png").shape[1] == 400
+    assert '"sigmas":3' in before and '"sigmas":1' in Path("a/report.html").read_text()
+    for given, wanted in {
+        "picture.view=below": "picture.view: got 'below', expected",
+        "picture.colours.rover=reddish": "a colour of matplotlib for rover",
+        "map.type=dense": "--set map changes no picture of a run, expected picture.KEY=VALUE",
+    }.items():
+        assert wanted in refused(kalmark("report", "a", "--set", given))

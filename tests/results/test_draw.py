@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -9,11 +11,19 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
+from matplotlib.image import imread
 
 import kalmark as km
 from kalmark.logs.log import Log, Trajectory
 from kalmark.report import Report
-from kalmark.results.scene import OUTCOME_COLOURS
+from kalmark.results.plot import draw_map, save_map
+from kalmark.results.record import record
+from kalmark.results.report import series
+from kalmark.results.run import Run
+from kalmark.results.scene import OUTCOME_COLOURS, Scene
+from results_space import slam_for as slam_in_space
+from results_space import spiral
+from results_world import circle, slam_for
 
 POSTS = {1: (4.0, 1.0), 2: (2.0, 3.0), 3: (-1.0, 2.0)}
 
@@ -188,3 +198,49 @@ def test_a_path_or_a_truth_of_another_shape_is_refused_in_one_line() -> None:
         km.draw(slam, limits_m=[1, 0, 0, 1])
     with pytest.raises(km.KalmarkError, match="view is 'below', expected"):
         km.draw(slam, view="below")
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    log = circle(steps=12, landmarks=5)
+    return record(slam_for(log), log, progress=False)
+
+
+def drawn(run: Run, **options: Any) -> Run:
+    return replace(run, config=run.config | {"picture": options})
+
+
+def test_the_section_of_a_configuration_changes_the_map_of_a_run(run: Run, tmp_path: Path) -> None:
+    options = {"ellipses": "off", "truth": False, "labels": True, "limits_m": [-20, 20, -10, 30], "width_px": 500}
+    other = drawn(run, **options, colours={"rover": "tab:red"})
+    (axes,) = draw_map(other).axes
+    labels = {text.get_text() for text in draw_map(other).legends[0].get_texts()}
+    assert labels == {"estimated path", "estimated landmarks", "start", "end", "dead reckoning"}
+    assert (*axes.get_xlim(), *axes.get_ylim()) == (-20, 20, -10, 30)
+    assert texts(axes) == [str(i) for i in run.landmarks.ids]
+    assert to_hex(axes.lines[0].get_color()) == to_hex("tab:red")
+    save_map(other, tmp_path / "map.png")
+    assert imread(tmp_path / "map.png").shape[1] == 500
+
+
+def test_the_section_changes_the_page(run: Run) -> None:
+    usual = series(run, Scene.of(run))["picture"]
+    assert usual == {
+        "eye": None, "flat": False, "orbit": False, "sigmas": 3.0, "labels": False, "truth": True, "colours": {},
+    }  # fmt: skip
+    other = drawn(run, sigmas=1.0, labels=True, truth=False, colours={"landmarks": "red"}, limits_m=[0, 1, 2, 3])
+    data = series(other, Scene.of(other))
+    changed = {"sigmas": 1.0, "labels": True, "truth": False, "colours": {"landmarks": "#ff0000"}}
+    assert data["picture"] == usual | changed
+    assert data["box"] == {"low": [0, 2], "high": [1, 3]}
+
+
+def test_a_view_of_space_turns_map_and_page() -> None:
+    log = spiral(steps=6)
+    side = drawn(record(slam_in_space(log), log, progress=False), view="side")
+    space, plan = draw_map(side).axes
+    assert (space.get_xlabel(), space.get_ylabel(), plan.get_xlabel()) == ("x (m)", "z (m)", "x (m)")
+    page = series(side, Scene.of(side))["picture"]
+    assert page["flat"] and page["eye"] == [0.0, -1.0, 0.0]
+    orbit = drawn(side, view="orbit")
+    assert series(orbit, Scene.of(orbit))["picture"]["orbit"]

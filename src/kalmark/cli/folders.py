@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from kalmark.cli.shared import RunFolder, Trust, limit_blas_threads, print_summary, print_table, say, writable
 from kalmark.errors import PluginError
+
+if TYPE_CHECKING:
+    from kalmark.results.run import Run
+
+PictureOptions = Annotated[
+    list[str] | None, typer.Option("--set", metavar="picture.KEY=VALUE", help="Draw with another option of `picture`.")
+]
 
 
 def evaluate(
@@ -47,6 +55,21 @@ def evaluate(
         print_summary(str(run), summary)
 
 
+def drawn_by(run: Run, options: Sequence[str] | None) -> Run:
+    """Return a run with options of its pictures replaced.  Raises ConfigError."""
+    from kalmark.config import Config, config_dict
+    from kalmark.config.reading import validate
+    from kalmark.config.tree import tree_of
+    from kalmark.errors import ConfigError
+
+    if not options:
+        return run
+    tree = tree_of({"picture": run.config.get("picture") or {}}, options)
+    if other := sorted(tree.values.keys() - {"picture"}):
+        raise ConfigError(f"--set {other[0]} changes no picture of a run, expected picture.KEY=VALUE")
+    return replace(run, config=run.config | {"picture": config_dict(validate(tree, Config))["picture"]})
+
+
 def report(
     run: RunFolder,
     trust: Trust = False,
@@ -58,11 +81,12 @@ def report(
         bool,
         typer.Option("--world", help="Draw the ellipses in the world, with the start's uncertainty, not of the shape."),
     ] = False,
+    options: PictureOptions = None,
 ) -> None:
     """Write map.png, report.html and a figure of each camera's last scan again."""
     from kalmark.results.run import Run
 
-    loaded = Run.load(run, trust)
+    loaded = drawn_by(Run.load(run, trust), options)
     for path in loaded.report(run, world):
         say(str(path))
     if video:
@@ -79,6 +103,7 @@ def view(
         Path | None, typer.Option(metavar="FILE.rrd", help="Write what the viewer would show to a file of rerun.")
     ] = None,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
+    options: PictureOptions = None,
 ) -> None:
     """Replay a run in rerun, or without it on its page: a slider through time, the map, errors and associations."""
     import webbrowser
@@ -87,7 +112,7 @@ def view(
     from kalmark.results.run import Run
 
     if save is not None or (open_ and not page):
-        loaded = Run.load(run, trust)
+        loaded = drawn_by(Run.load(run, trust), options)
         try:
             load("viewers", "rerun").replay(loaded, save)
         except PluginError as error:
@@ -98,8 +123,8 @@ def view(
             say("rerun shows it" if save is None else str(save))
             return
     file = run / "report.html"
-    if not file.is_file() or not (run / "summary.json").is_file():
-        Run.load(run, trust).report(run)
+    if options or not file.is_file() or not (run / "summary.json").is_file():
+        drawn_by(Run.load(run, trust), options).report(run)
     shown = open_ and webbrowser.open(file.resolve().as_uri())
     say(f"{file}{'' if shown or not open_ else ': no browser was found, open it yourself'}")
 

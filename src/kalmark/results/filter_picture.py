@@ -61,7 +61,10 @@ def draw(
     picture = Picture(**{"ellipses": "world"} | options)
     scene = scene_of_filter(slam, truth, [report] if isinstance(report, Report) else report, path, picture)
     if ax is None:
-        ax = subplots(layout="constrained")[1]
+        figure, ax = subplots(layout="constrained")
+        if picture.width_px is not None:
+            width = picture.width_px / figure.get_dpi()
+            figure.set_size_inches((width, 0.75 * width))
     for artist in [*ax.get_children()]:
         if artist.get_gid() == DRAWN:
             artist.remove()

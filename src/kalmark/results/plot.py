@@ -33,6 +33,7 @@ from kalmark.results.scene import (
     Scene,
     break_path,
     join_polylines,
+    picture_of,
     squares,
 )
 from kalmark.results.verdict_text import alarm
@@ -93,7 +94,8 @@ def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim
 
 def save_map(run: Recording, path: str | PathLike[str], world: bool = False) -> None:
     """Draw the map of a run and write it as a PNG, with the ellipses of its shape or those in the world."""
-    save_figure(draw_map(run, world=world), path)
+    figure, width_px = draw_map(run, world=world), picture_of(run).width_px
+    save_figure(figure, path, 130.0 if width_px is None else width_px / figure.get_figwidth(), rim=width_px is None)
 
 
 def draw_map(
@@ -106,13 +108,14 @@ def draw_map(
     the section `picture` of the run's configuration.
     """
     scene = Scene.of(run, step, world)
-    spans = [(scene.high - scene.low)[:2]]
+    spans, flat = [(scene.high - scene.low)[:2]], False
     if scene.d == 3:
         projection = Projection.of(scene, view)
+        flat = projection.distance == np.inf
         spans.insert(0, np.subtract(*reversed(projection.frame(scene.low, scene.high))))
     aspects = [float(np.clip(span[0] / span[1], 0.5, 4.0)) for span in spans]
     tall = float(np.clip(INCHES[scene.d] / sum(aspects), 3.0, 8.5))
-    width = max(sum(aspects) * tall + 0.2 + 0.65 * len(spans), 6.0)
+    width = max(sum(aspects) * tall + 0.2 + 0.65 * (len(spans) + flat), 6.0)
     title, figures = headline(run)
     lines, handles = _lines(figures, int(CHARACTERS * width)), legend(scene)
     told = [*dict.fromkeys((*summary_of(run)["warnings"], *alarm(summary_of(run).get("verdict"))))]
@@ -121,9 +124,10 @@ def draw_map(
     below, above = 0.6 + 0.25 * -(-len(handles) // columns), 0.55 + LINE_INCHES * (len(lines) + len(alarms))
     figure = Figure(figsize=(width, tall + below + above), facecolor="white")
     height = figure.get_figheight()
-    left = 0.1 if scene.d == 3 else 0.75
+    left = 0.1 if scene.d == 3 and not flat else 0.75
     if scene.d == 3:
-        at = left / width, (below - 0.3) / height, aspects[0] * tall / width, (tall + 0.3) / height
+        drop = 0.0 if flat else 0.3  # perspective needs no room for labels below
+        at = left / width, (below - drop) / height, aspects[0] * tall / width, (tall + drop) / height
         draw_space(figure.add_axes(at), scene, projection)
     wide = aspects[-1] * tall
     at = (width - 0.15 - wide if scene.d == 3 else left) / width, below / height, wide / width, tall / height

@@ -16,6 +16,7 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_hex
 
 from kalmark.arrays import Array
 from kalmark.report import OUTCOMES
@@ -35,6 +36,7 @@ from kalmark.results.figure_texts import (
 )
 from kalmark.results.history import Camera, History, Ints, LandmarkChange, MapSnapshot
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
+from kalmark.results.plot import Projection
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
     POINTS,
@@ -71,8 +73,8 @@ _ROBOT = (
     ("diverged", "diverged", ""),
 )
 _HINTS = {
-    False: "3-sigma ellipses {}; arrow keys: single steps",
-    True: "3-sigma ellipsoids {}; drag to turn, scroll to come closer, arrow keys: single steps",
+    False: "ellipses {}; arrow keys: single steps",
+    True: "ellipsoids {}; drag to turn, scroll to come closer, arrow keys: single steps",
 }
 
 
@@ -111,8 +113,14 @@ def report_html(run: Recording, world: bool = False) -> str:
         data=json.dumps(series(run, scene), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
         scene=_resource("scene.js"),
         script=_resource("report.js"),
-        hint=_HINTS[run.history.in_space].format(scene.of_what),
+        hint=map_hint(scene),
     )
+
+
+def map_hint(scene: Scene) -> str:
+    """Return the line beside the title of the map."""
+    ellipses, _, keys = _HINTS[scene.d == 3].format(scene.of_what).partition("; ")
+    return keys if scene.picture.ellipses == "off" else f"{scene.picture.sigmas:g}-sigma {ellipses}; {keys}"
 
 
 def robot_table(summary: dict[str, Any]) -> str:
@@ -193,6 +201,7 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
     true = scene.true_points()
     return {
         "box": {"low": round_values(scene.low, 3), "high": round_values(scene.high, 3)},
+        "picture": page_options(scene),
         "ellipses": scene.of_what,
         "how": scene.how,
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
@@ -212,6 +221,22 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
         "neesBounds": anees_interval(dof),
         "outcomes": _outcomes(run, t),
         "association": _association(run, t, scene.world),
+    }
+
+
+def page_options(scene: Scene) -> dict[str, Any]:
+    """Return the options of the pictures of a page; `eye` is the direction to the eye in space."""
+    picture = scene.picture
+    view = "normal" if picture.view == "self" else picture.view
+    eye = Projection.of(scene, view).axes[2] if scene.d == 3 else np.zeros(3)
+    return {
+        "eye": None if view in ("normal", "orbit") else round_values(eye, 4),
+        "flat": view in ("top", "side", "front"),
+        "orbit": view == "orbit",
+        "sigmas": 0.0 if picture.ellipses == "off" else picture.sigmas,
+        "labels": bool(picture.labels),
+        "truth": picture.truth,
+        "colours": {name: to_hex(colour) for name, colour in (picture.colours or {}).items()},
     }
 
 

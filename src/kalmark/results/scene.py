@@ -424,6 +424,11 @@ def images(history: History, camera: Camera, step: int) -> list[Image]:
     return found
 
 
+def sides_of(camera: Camera) -> list[str]:
+    """Return the names of a camera's images: "left" and "right" of a pair, "" of a single one."""
+    return [SIDES[side] for side in _points(camera)]
+
+
 def images_of_report(camera: Camera, report: Report, kinds: Sequence[str]) -> list[Image]:
     """Return the images of a scan that a camera made; `kinds` are those of the landmarks of its observations."""
     points = _points(camera)

@@ -22,7 +22,7 @@ from kalmark.results.evaluate import headline
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_scan import draw_image
 from kalmark.results.recording import Recording
-from kalmark.results.scene import INK, Scene, images, steps_of
+from kalmark.results.scene import INK, Scene, images, picture_of, steps_of
 
 INCHES, DPI = (12.8, 7.2), 80
 MOST_IMAGES = 3  # beside the map
@@ -33,15 +33,15 @@ def write_video(
     path: str | Path,
     fps: float = 10.0,
     frames: int = 200,
-    orbit_deg: float = 0.0,
+    orbit_deg: float | None = None,
     progress: bool = True,
     world: bool = False,
 ) -> Path:
     """Write a run as a video of at most so many frames and return its path.
 
     The suffix of `path` becomes ``.gif`` if it is ``.mp4`` and ffmpeg is not installed.  In space the view turns by
-    `orbit_deg` in all.  Ellipses are those of the shape, or in the `world`.  Raises RunError for a run without scans
-    and for other suffixes.
+    `orbit_deg` in all, by default once around if the view of the run's pictures is "orbit".  Ellipses are those of the
+    shape, or in the `world`.  Raises RunError for a run without scans and for other suffixes.
     """
     path = Path(path)
     if path.suffix not in (".mp4", ".gif"):
@@ -54,6 +54,8 @@ def write_video(
         path = path.with_suffix(".gif")
     count = len(run.history.t_ns)
     steps = np.unique(np.linspace(0, count - 1, max(1, min(frames, count))).round().astype(int)).tolist()
+    if orbit_deg is None:
+        orbit_deg = 360.0 if picture_of(run).view == "orbit" else 0.0
     drawn = partial(_frames, run, steps, orbit_deg, progress, world)
     replace_file(path, partial(_mp4 if path.suffix == ".mp4" else _gif, drawn(), fps))
     return path
@@ -61,7 +63,8 @@ def write_video(
 
 def _mp4(drawn: Iterator[Figure], fps: float, path: Path) -> None:
     writer: Any = FFMpegWriter(fps=fps)  # type: ignore[arg-type]
-    with writer.saving(next(drawn), str(path), DPI):
+    first = next(drawn)
+    with writer.saving(first, str(path), first.get_dpi()):
         writer.grab_frame()
         for _ in drawn:  # the same figure, drawn again
             writer.grab_frame()
@@ -97,7 +100,8 @@ def _draw(figure: Figure, run: Recording, scene: Scene, step: int, turned: float
         draw_plan(figure.add_axes((0.07, 0.09, 0.9, 0.84)), scene)
         return
     elevation, azimuth = VIEWS["normal"]
-    projection = Projection.of(scene, (elevation, azimuth + turned))
+    view = (elevation, azimuth + turned) if scene.picture.view in ("normal", "orbit") else None
+    projection = Projection.of(scene, view)
     seen = _last_images(run, step, pictures)
     left = 0.5 if any(picture is not None for *_, picture in seen) else 0.6  # the images are larger than their marks
     draw_space(figure.add_axes((0.0, 0.02, left, 0.92)), scene, projection)

@@ -30,6 +30,7 @@ from kalmark.results.scene import (
     Scene,
     colour_of,
     contours,
+    sides_of,
     squares,
 )
 from kalmark.results.truth import poses_of_size
@@ -113,7 +114,15 @@ class Stream:
             rrb.TimeSeriesView(origin="sigma", name="sigmas"),
             rrb.Spatial2DView(origin="covariance", name="correlations of P"),
         ]
-        views = [rrb.Spatial2DView(origin=f"images/{c.robot}/{c.sensor}", name=c.sensor) for c in scene.cameras]
+        views = [
+            rrb.Spatial2DView(
+                origin="/".join(filter(None, ["images", c.robot, c.sensor, side])),
+                name=f"{c.sensor} {side}".strip(),
+                visual_bounds=rrb.VisualBounds2D(x_range=(0.0, c.size[0]), y_range=(0.0, c.size[1])),
+            )
+            for c in scene.cameras
+            for side in sides_of(c)
+        ]
         beside = rrb.Vertical(*figures)
         left = rrb.Vertical(three, rrb.Horizontal(*views), row_shares=[2, 1]) if views else three
         return rrb.Blueprint(rrb.Horizontal(left, beside, column_shares=[2, 1]), collapse_panels=True)

@@ -87,10 +87,11 @@ function drawMap() {
   if (!DATA.maps.length) { el("map").textContent = "No scan was processed."; return; }
   const slider = el("time"), draw = mapPicture(), mapped = DATA.maps.some(map => map.count);
   const steps = [...new Set(DATA.robots.flatMap(r => r.t))].sort((a, b) => a - b), pace = Math.ceil(steps.length / 120);
+  let timer = null;
   const show = () => {  /* the robots at a step, and the map that was kept last until then */
     const now = steps[+slider.value], kept = Math.max(0, upTo(DATA.maps.map(map => map.t - 5e-4), now) - 1);
     el("now").textContent = `step ${+slider.value + 1} of ${steps.length} · ${now.toFixed(2)} s` + (mapped ? ` · ${DATA.maps[kept].count} landmarks` : "");
-    draw(kept, now);
+    draw(kept, now, timer !== null);
   };
   const move = by => { slider.value = +slider.value + by; show(); };
   slider.max = steps.length - 1;
@@ -104,7 +105,6 @@ function drawMap() {
     event.preventDefault();
     move(by);
   });
-  let timer = null;
   el("play").addEventListener("click", () => {
     if (timer !== null) { clearInterval(timer); timer = null; el("play").textContent = "Play"; return; }
     if (+slider.value >= +slider.max) slider.value = 0;

@@ -1,11 +1,13 @@
 "use strict";
 /* The map of a run, in the plane or in space, where it turns under the mouse, and the images of cameras at the slider. */
 const AXES = DATA.dof === 3 ? ["x", "y"] : ["x", "y", "z"], SPACE = AXES.length === 3;
-const TRUTH = SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)", FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = "#8c1c13", ALARM = "#b3261e", KNOWN = "#2f7d4f";
+const PICTURE = DATA.picture, colourOf = (name, usual) => PICTURE.colours[name] || usual;
+const TRUTH = colourOf("truth", SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)"), FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = colourOf("lines", "#8c1c13"), ALARM = "#b3261e", KNOWN = "#2f7d4f";
 const MEASURED = "#7d838d", SEGMENT = "rgba(58,104,200,0.55)";
-const SIGMAS = `3 sigma ${DATA.ellipses}`;
-const GROUPS = !SPACE ? [["#d2691e", `landmarks, ${SIGMAS}`]] :
-  [["#1f5fa8", `landmarks, ${SIGMAS}`], ["#c8412f", `landmarks that are not Euclidean, ${SIGMAS}`], [LINE, `lines, ${SIGMAS}, of their ends`]];
+const SIGMAS = PICTURE.sigmas ? `, ${PICTURE.sigmas} sigma ${DATA.ellipses}` : "";
+const GROUPS = !SPACE ? [[colourOf("landmarks", "#d2691e"), `landmarks${SIGMAS}`]] :
+  [[colourOf("landmarks", "#1f5fa8"), `landmarks${SIGMAS}`], [colourOf("others", "#c8412f"), `landmarks that are not Euclidean${SIGMAS}`],
+   [LINE, `lines${SIGMAS}${SIGMAS && ", of their ends"}`]];
 
 /* Points with what `value` (axis) gives of each axis. */
 const along = (value, axes = AXES) => Object.fromEntries([...axes].map(k => [k, value(k)]));
@@ -17,10 +19,10 @@ function boxed(p) {
   return {...p, ...along(k => p[k].map((v, i) => keep[i] ? v : null))};
 }
 
-/* The 3-sigma contours of the Gaussians `rows` as one broken line, mean + 3 L c with P = L L': ellipses, in space three
+/* The n-sigma contours of the Gaussians `rows` as one broken line, mean + n L c with P = L L': ellipses, in space three
    great circles of each ellipsoid. */
-function contours(g, rows, points = 24, axes = AXES) {
-  const out = along(() => [], axes), circles = axes.length === 2 ? [[0, 1]] : [[0, 1], [1, 2], [0, 2]];
+function contours(g, rows, points = 24, axes = AXES, sigmas = PICTURE.sigmas) {
+  const out = along(() => [], axes), circles = !sigmas ? [] : axes.length === 2 ? [[0, 1]] : [[0, 1], [1, 2], [0, 2]];
   for (const i of rows) {
     if (g.pxx[i] === null || g.x[i] === null) continue;
     const L = [];
@@ -34,7 +36,7 @@ function contours(g, rows, points = 24, axes = AXES) {
     }
     for (const [u, v] of circles) {
       for (let k = 0; k <= points; k++) {
-        const c = 3 * Math.cos(2 * Math.PI * k / points), s = 3 * Math.sin(2 * Math.PI * k / points);
+        const c = sigmas * Math.cos(2 * Math.PI * k / points), s = sigmas * Math.sin(2 * Math.PI * k / points);
         L.forEach((row, a) => out[axes[a]].push(g[axes[a]][i] + row[u] * c + row[v] * s));
       }
       for (const k of axes) out[k].push(null);
@@ -91,10 +93,10 @@ function still() {
   each(Object.values(DATA.usedFixes), "fixes used", f => marks(f, thin("x", FIX), [5, 2], skip));
   const thinly = r => { const s = stroke(r.dead, r.colour, 0.9, {opacity: 0.5}); return {...s, line: {...s.line, dash: "dash"}}; };
   each(DATA.robots.filter(r => r.dead), "dead reckoning", thinly);
-  each(DATA.robots.filter(r => r.truth), `true path${DATA.how}`, r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
+  each(DATA.robots.filter(r => PICTURE.truth && r.truth), `true path${DATA.how}`, r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
   if (DATA.repeats.x.length) traces.push(stroke(DATA.repeats, ALARM, 1.2, {...skip, name: "landmarks mapped twice"}));
-  if (DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: `true lines${DATA.how}`}));
-  if (l.x.length)
+  if (PICTURE.truth && DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: `true lines${DATA.how}`}));
+  if (PICTURE.truth && l.x.length)
     traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],
                       {name: `true landmarks${DATA.how}`, hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
   if (DATA.unseenLandmarks.x.length)
@@ -125,7 +127,8 @@ function moving(map, now) {
     traces.push(stroke(contours(map, rows, corners), color, width,
                        {name, legendgroup: name, showlegend: shown, opacity: SPACE ? 0.6 : 1}));
     traces.push(marks({...boxed(along(pick)), text: pick("id"), customdata: sigma}, {color, symbol: many && SPACE ? "square" : "circle"}, many ? [3, 1.8] : [5, 3],
-                      {legendgroup: name, ...quiet, hovertemplate: `%{text}: ${WHERE}<br>sigma %{customdata:.3g} m<extra></extra>`}));
+                      {legendgroup: name, ...quiet, mode: PICTURE.labels ? "markers+text" : "markers", textposition: "top center",
+                       textfont: {size: 10}, hovertemplate: `%{text}: ${WHERE}<br>sigma %{customdata:.3g} m<extra></extra>`}));
   });
   traces.push(stroke(boxed(map.lines), LINE, SPACE ? 1.6 : 2.2, quiet));
   if (SPACE) traces.push(stroke(map.tags, TAG, 1.2, quiet));
@@ -139,7 +142,7 @@ function moving(map, now) {
     else traces.push({...dart(r, at), mode: "lines", ...own, fill: "toself", fillcolor: r.colour,
                       line: {color: "white", width: 1}, hovertemplate: `${r.name}: ${WHERE}<extra></extra>`});
     traces.push(stroke(contours(r, at, 48), SPACE ? POSE : r.colour, SPACE ? 0.8 : 1.4,
-                       {name: `robot, ${SIGMAS}`, legendgroup: "pose", showlegend: SPACE && i === 0}));
+                       {name: `robot${SIGMAS}`, legendgroup: "pose", showlegend: SPACE && i === 0}));
   });
   return traces;
 }
@@ -153,14 +156,28 @@ function planarPage() {
                  legend: {orientation: "h", y: -48 / (height - 100), yanchor: "top"}});
 }
 
+/* The camera of the picture's view: in perspective, or from the top, the side or the front without. */
+function cameraOf(eye) {
+  const center = {x: 0, y: 0, z: eye ? 0 : -0.18};
+  if (!eye) return {center, eye: {x: 0.95, y: -1.4, z: 0.9}, up: {x: 0, y: 0, z: 1}};
+  return {center, eye: along(k => (PICTURE.flat ? 1.1 : 1.9) * eye["xyz".indexOf(k)]), up: Math.abs(eye[2]) > 0.99 ? {x: 0, y: 1, z: 0} : {x: 0, y: 0, z: 1},
+          projection: {type: PICTURE.flat ? "orthographic" : "perspective"}};
+}
+
+/* The camera turned about the vertical, as it is while an orbit is played. */
+function turned(camera, degrees) {
+  const c = Math.cos(degrees * Math.PI / 180), s = Math.sin(degrees * Math.PI / 180), {x, y, z} = camera.eye;
+  return {...camera, eye: {x: c * x - s * y, y: s * x + c * y, z}};
+}
+
 function spatialPage() {
-  const {low, high} = DATA.box, spans = high.map((v, a) => v - low[a]), unit = Math.max(...spans) / 1.05;
+  const {low, high} = DATA.box, spans = high.map((v, a) => v - low[a]), unit = Math.max(...spans) / (PICTURE.flat ? 2 : 1.05);
   const side = (title, a) => ({title: {text: title}, range: [low[a], high[a]], backgroundcolor: "white", gridcolor: "#e6e8ec",
                                zerolinecolor: "#e6e8ec", showspikes: false});
   return layout({height: 640, uirevision: "map", margin: {l: 0, r: 0, t: 0, b: 0}, legend: {orientation: "h", y: 0.02, x: 0.02},
     scene: {aspectmode: "manual", aspectratio: {x: spans[0] / unit, y: spans[1] / unit, z: spans[2] / unit}, uirevision: "map",
             xaxis: side("x (m)", 0), yaxis: side("y (m)", 1), zaxis: side("z (m)", 2),
-            camera: {center: {x: 0, y: 0, z: -0.18}, eye: {x: 0.95, y: -1.4, z: 0.9}, up: {x: 0, y: 0, z: 1}}, dragmode: "turntable"}});
+            camera: cameraOf(PICTURE.eye), dragmode: PICTURE.flat ? "orbit" : "turntable"}});
 }
 
 /* The picture of a map: a function that draws the map of a number and the robots at a time, and images if they are in view. */
@@ -169,10 +186,10 @@ function mapPicture() {
   let shownMap = 0;
   const images = () => DATA.cameras.forEach((camera, i) => drawImages(camera, i, shownMap));
   if (DATA.cameras.length) inView("images", images);
-  return (kept, now) => {
+  return (kept, now, playing) => {
     shownMap = kept;
     const shown = el("map")._fullLayout?.scene?._scene;  /* the slider must not turn the view back */
-    if (shown) page.scene.camera = shown.getCamera();
+    if (shown) page.scene.camera = PICTURE.orbit && playing ? turned(shown.getCamera(), 3) : shown.getCamera();
     Plotly.react("map", [...background, ...moving(DATA.maps[kept], now)], page, CONFIG);
     if (!waiting.has(el("images"))) images();
   };
@@ -215,7 +232,7 @@ function drawImage(id, camera, scan, image) {
     if (s.y.length && single) marks.measured.push([...s.y[0], s.name]); else if (s.y.length) add(SEGMENT, "measured", "solid", 4, close(s.y));
     if (s.outcome in marks) marks[s.outcome].push(...s.y.map(p => [...p, s.name]));
     if (s.e && single && s.Z) {
-      const e = contours({x: [s.e[0][0]], y: [s.e[0][1]], pxx: [s.Z[0]], pxy: [s.Z[1]], pyy: [s.Z[2]]}, [0], 32, "xy");
+      const e = contours({x: [s.e[0][0]], y: [s.e[0][1]], pxx: [s.Z[0]], pxy: [s.Z[1]], pyy: [s.Z[2]]}, [0], 32, "xy", 3);
       add(s.colour, s.meaning, dash, 1.4, e.x.slice(0, -1).map((x, k) => [x, e.y[k]]));
     } else if (s.e) add(s.colour, s.meaning, dash, 1.4, s.e.length === 2 ? trimmed(s.e, size) : close(s.e));
     if (s.name && s.outcome !== "ignored" && image.seen.length <= 30) {
