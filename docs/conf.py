@@ -61,6 +61,11 @@ sphinx_gallery_conf = {
     "default_thumb_file": str(DOCS / "images" / "cloister.png"),
 }
 
+for pages, programs in zip(sphinx_gallery_conf["gallery_dirs"], sphinx_gallery_conf["examples_dirs"], strict=True):
+    for page in (DOCS / pages).glob("plot_*"):  # of an earlier build
+        if not (DOCS / programs / page.name.partition(".")[0]).with_suffix(".py").exists():
+            page.unlink()
+
 html_theme = "pydata_sphinx_theme"
 html_title = "kalmark"
 html_static_path = ["site/static"]

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags
+from kalmark.arrays import Array, Flags, block_diagonal
 from kalmark.errors import DivergedError
 from kalmark.events import Id, Scan
 from kalmark.geometry.angles import wrap
@@ -355,12 +355,3 @@ def scores_of(
     parts = zip(own[..., :d], P[..., :d, :d], series["position_m"], truth[..., :d], strict=True)
     lost = any(has_diverged(*part) for part in parts)
     return Scores(series, aligned, rmse(place - true), count, nis, nis_dof, lost or bool(stopped), stopped)
-
-
-def block_diagonal(blocks: list[Array]) -> Array:
-    """Return the matrix with these blocks on its diagonal: scipy's takes as long as the scores of a map."""
-    F, i, j = np.zeros(np.sum([block.shape for block in blocks], axis=0)), 0, 0
-    for block in blocks:
-        F[i : i + block.shape[0], j : j + block.shape[1]] = block
-        i, j = i + block.shape[0], j + block.shape[1]
-    return F

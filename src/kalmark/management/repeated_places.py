@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags, Index
+from kalmark.arrays import Array, Flags, Index, block_diagonal
 from kalmark.association.ratio import log_ratios
 from kalmark.association.relocalization import align_points
 from kalmark.events import Id
@@ -496,13 +496,5 @@ def displacement(map_: Map, slots: list[int], repeat: Repeat) -> Displacement:
         G.append(G_x)
     far, all_ = float(repeat.shift @ repeat.shift), np.concatenate(G)
     return Displacement(
-        slots, means, _block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T
+        slots, means, block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T
     )
-
-
-def _block_diagonal(blocks: list[Array]) -> Array:
-    ends = np.cumsum([len(block) for block in blocks])
-    out = np.zeros((ends[-1], ends[-1]))
-    for block, end in zip(blocks, ends.tolist(), strict=True):
-        out[end - len(block) : end, end - len(block) : end] = block
-    return out

@@ -29,7 +29,6 @@ from kalmark.arrays import Array, Index
 
 ROUNDS, SAME = 10, 1e-6  # until the weights are those of the shape
 REGULAR = 1e-15
-LOW = 0.25  # the quartile
 EXACT_M = 1e-9
 
 
@@ -50,20 +49,21 @@ class Datum(NamedTuple):
         q = 3 * (d - 1)
         free = la.null_space(generators(fixed, origin)[:, :d].reshape(-1, q)) if len(fixed) else np.eye(q)
         G = generators(points, origin)[:, :d] @ free
-        seen, own = across @ G, _blocks(P, d)
-        v = np.trace(own, axis1=1, axis2=2)
+        seen, own = across @ G, np.einsum("kij,kji->k", across, _blocks(P, d))
+        v = np.trace(_blocks(P, d), axis1=1, axis2=2)
         for _ in range(ROUNDS):
-            weighted = seen / (v + np.quantile(v, LOW) + EXACT_M**2)[:, None, None]
+            weighted = seen / (v + _lower_quartile(v) + EXACT_M**2)[:, None, None]
             w, V = np.linalg.eigh(np.einsum("kia,kib->ab", weighted, seen))
             regular = w > REGULAR * w.max(initial=0.0)
             V, w = V[:, regular], w[regular]
-            T = V @ (V / w).T @ weighted.reshape(len(P), len(V)).T
+            T = V @ (V / w).T @ weighted.reshape(len(P), len(G[0, 0])).T
             X = P @ T.T
-            before, moved = v, _moved(own, G, X.reshape(*seen.shape), T @ X)
-            v = np.maximum(np.trace(across @ moved @ across, axis1=1, axis2=2), 0.0)
+            before, L = v, T @ X
+            moved = np.sum(seen * (seen @ L - 2.0 * X.reshape(seen.shape)), axis=(1, 2))
+            v = np.maximum(own + moved, 0.0)
             if np.all(np.abs(v - before) <= SAME * v):
                 break
-        return cls(origin, free @ T, free @ (T @ X) @ free.T)
+        return cls(origin, free @ T, free @ L @ free.T)
 
     def shape(self, G: Array, P: Array, X: Array) -> Array:
         """Return the covariances (..., m, m) of the shape of what moves by G (..., m, q), has P, and X = C T'.
@@ -84,6 +84,13 @@ def generators(points: Array, origin: Array) -> Array:
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             G[:, i, 3 + j], G[:, j, 3 + i] = lever[:, k], -lever[:, k]
     return G
+
+
+def _lower_quartile(v: Array) -> float:
+    """Return the lower quartile of v (N,), between its two neighbours."""
+    ordered, at = np.sort(v), 0.25 * (len(v) - 1)
+    low = int(at)
+    return float(ordered[low] + (at - low) * (ordered[min(low + 1, len(v) - 1)] - ordered[low]))
 
 
 def shape_of_points(points: Array, P: Array, of: Index) -> Array:

@@ -27,9 +27,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, block_diagonal
 from kalmark.declare import is_own
 from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
@@ -231,7 +230,7 @@ class MapLandmarks:
         some = order[np.unique(np.linspace(0, len(order) - 1, min(DATUM, len(order))).round().astype(int))].tolist()
         ends, names = [_ends(self.means[k][None], d)[0] for k in some], [self.ids[k] for k in some]
         to_place = {k: _place_jacobian(slam, self.ids[k]) for k in order.tolist()}
-        J = la.block_diag(*(to_place[k][: e.size] for k, e in zip(some, ends, strict=True)))
+        J = block_diagonal([to_place[k][: e.size] for k, e in zip(some, ends, strict=True)])
         across = np.concatenate([_across(e) if len(e) > 1 else np.eye(d)[None] for e in ends])
         datum = Datum.of(np.concatenate(ends), across, J @ slam.covariance(*names) @ J.T, points[exact])
         onto = (datum.T @ J).T

@@ -52,7 +52,8 @@ def expectations(
     if names is None:
         names = [*tracks.confirmed, *(_reached(map_, tracks, channel, slot) if only_in_view else tracks.known)]
     count, m, p = len(names), len(channel.sensor.columns), channel.dof
-    in_view, why = np.zeros(count, dtype=np.bool_), [_not_observed(channel, tracks, name, robot) for name in names]
+    in_view = np.zeros(count, dtype=np.bool_)
+    why: list[str | None] = [None] * count
     found: list[tuple[Index, Linearised]] = []
     for model, group in tracks.by_model(channel, names, robot):
         rows = np.array(group)
@@ -89,12 +90,14 @@ def expectations(
             to[where] = array
     for i in np.flatnonzero(in_view & ~np.isfinite(whole.e).all(axis=1)).tolist():
         in_view[i], why[i] = False, "nothing can be expected of it from here"
-    E_h, kinds = whole.E_h, tuple(str(tracks.sort(name)) for name in names)
-    all_ = Expectations(
-        robot, sensor, tuple(channel.sensor.columns), tuple(names), kinds, in_view, tuple(why), whole.e, whole.Z,
-        E_h[:, :, :dof], E_h[:, :, dof : 2 * dof], E_h[:, :, 2 * dof :], whole.E_l,
+    asked = np.flatnonzero(in_view).tolist() if only_in_view else list(range(count))
+    e, Z, E_h, E_l = (array[asked] for array in whole)
+    shown, reasons = tuple(names[i] for i in asked), (why[i] for i in asked)
+    texts = (_not_observed(channel, tracks, n, robot) if w is None else w for n, w in zip(shown, reasons, strict=True))
+    return Expectations(
+        robot, sensor, tuple(channel.sensor.columns), shown, tuple(str(tracks.sort(name)) for name in shown),
+        in_view[asked], tuple(texts), e, Z, E_h[:, :, :dof], E_h[:, :, dof : 2 * dof], E_h[:, :, 2 * dof :], E_l,
     )  # fmt: skip
-    return _of_rows(all_, np.flatnonzero(in_view)) if only_in_view else all_
 
 
 def _in_pose(E_h: Array, dof: int, times: int) -> Array:
@@ -108,16 +111,6 @@ def _reached(map_: Map, tracks: Tracks, channel: Channel, robot: int) -> list[Id
     limit, place = protocols.range_limit(channel.sensor), channel.pose(map_, robot)[: channel.dimensions]
     of = [known for kind, known in tracks.known.of_kind.items() if kind in channel.models]
     return [known.names[row] for known in of for row in known.within(place, limit)]
-
-
-def _of_rows(of: Expectations, rows: Index) -> Expectations:
-    """Return the expectations of some rows."""
-    texts = (tuple(column[i] for i in rows) for column in (of.names, of.kinds, of.why))
-    names, kinds, why = texts
-    arrays = (of.e, of.Z, of.E_r, of.E_s, of.E_p, of.E_l)
-    return Expectations(
-        of.robot, of.sensor, of.columns, names, kinds, of.in_view[rows], why, *(a[rows] for a in arrays)
-    )  # fmt: skip
 
 
 def _not_observed(channel: Channel, tracks: Tracks, name: Id, robot: str) -> str:
