@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import doctest
 import inspect
 import json
 import os
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -16,15 +14,13 @@ from typing import Any
 
 import api_pages
 import figures
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark import declare
 from kalmark.cli.app import app
 from kalmark.declare import built_in, is_own, registered_name, world_of_class
-from kalmark.logs import FORMATS, known_formats
+from kalmark.logs import known_formats
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -56,16 +52,11 @@ def test_an_example_runs(example: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lesson", LESSONS, ids=lambda p: p.stem)
-def test_a_lesson_runs_and_is_short(lesson: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lesson_is_short(lesson: Path) -> None:
+    """`make docs` runs lessons and tutorials."""
     text = lesson.read_text()
     code = [line for line in text.split('"""', 2)[2].splitlines() if line.strip() and not line.startswith("#")]
     assert len(code) <= 30
-    run_in_this_process(lesson, tmp_path, monkeypatch)
-
-
-@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda p: p.stem)
-def test_a_tutorial_runs(tutorial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_in_this_process(tutorial, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("program", [*LESSONS, *TUTORIALS], ids=lambda p: p.stem)
@@ -79,17 +70,6 @@ def test_a_figure_is_drawn_in_one_block_or_deferred(program: Path) -> None:
         names = set(re.findall(r"\w+", " ".join(made)))
         if names & set(re.findall(r"\w+", later[: again.start() if again else None])):
             assert "# sphinx_gallery_defer_figures" in block, f"{program.name}: {names}"
-
-
-def run_in_this_process(program: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run a program of the site; forget the models and formats that it registers."""
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(declare, "_CLASSES", copy.deepcopy(declare._CLASSES))
-    formats = dict(FORMATS)
-    runpy.run_path(str(program))
-    plt.close("all")
-    for name in FORMATS.keys() - formats.keys():
-        del FORMATS[name]
 
 
 EXAMPLES = {
