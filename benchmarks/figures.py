@@ -782,6 +782,10 @@ def structure() -> Iterator[Figure]:
         ("files that a control and a scan of unknown ids enter", "28"),
     ):
         yield Figure("Structure", name, wanted, "python benchmarks/structure.py", row(f"{name}:", "{0}"))
+    yield Figure("Structure", "the check of a change from nothing, with the site, 2 cores", "30 min; without the site 20",
+                 ".ci/run", row("all of it:", "{0} s"))  # fmt: skip
+    yield Figure("Structure", "items of the four documents: work / partly / missing", "all but the particle filter",
+                 "python docs/site/course_pages.py", row("items:", "{0} / {2} / {4}"))  # fmt: skip
     before = "python benchmarks/{} be0e13e"
     for count in (50, 1000):
         yield Figure("Structure", f"a step with {count} landmarks, as a part of that of be0e13e", ".8",
