@@ -1,6 +1,7 @@
 """The documentation site, built by `make docs`: Sphinx, MyST, the pydata theme and sphinx-gallery, all offline."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -8,9 +9,13 @@ DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS / "site"))
 os.environ["MPLBACKEND"] = "Agg"
 
+import matplotlib.animation  # noqa: E402
+
 import kalmark  # noqa: E402
 import kalmark.compiled  # noqa: E402
 
+# The buttons of an animation have the icons of the theme, none of a network
+matplotlib.animation.JS_INCLUDE = re.sub(r"<link[^>]*>", "", matplotlib.animation.JS_INCLUDE)
 kalmark.compiled.COMPILING = ""  # no page shows the note of the compiler
 
 project, author, release = "kalmark", "the authors of kalmark", kalmark.__version__

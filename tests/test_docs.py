@@ -56,7 +56,7 @@ def test_a_lesson_is_short(lesson: Path) -> None:
     """`make docs` runs lessons and tutorials."""
     text = lesson.read_text()
     code = [line for line in text.split('"""', 2)[2].splitlines() if line.strip() and not line.startswith("#")]
-    assert len(code) <= 30
+    assert len(code) - code.count("plt.show()") <= 30
 
 
 @pytest.mark.parametrize("program", [*LESSONS, *TUTORIALS], ids=lambda p: p.stem)

@@ -23,9 +23,12 @@ SEARCH = """
 addEventListener("DOMContentLoaded", () => {
   const box = document.getElementById("items-search"), count = document.getElementById("items-count");
   const rows = [...document.querySelectorAll(".bd-article section section tbody tr")];
+  const within = (text, number) => [...text.matchAll(/\\((\\d+)\\)-\\((\\d+)\\)/g)].some(
+    ([, first, last]) => first <= number && number <= last);
+  const has = (text, word) => text.includes(word) || (/^\\(\\d+\\)$/.test(word) && within(text, +word.slice(1, -1)));
   const show = () => {
     const words = box.value.toLowerCase().split(/\\s+/);
-    for (const row of rows) row.hidden = !words.every((word) => row.textContent.toLowerCase().includes(word));
+    for (const row of rows) row.hidden = !words.every((word) => has(row.textContent.toLowerCase(), word));
     for (const part of document.querySelectorAll(".bd-article section section"))
       part.hidden = !part.querySelector("tbody tr:not([hidden])");
     count.textContent = `${rows.filter((row) => !row.hidden).length} of ${rows.length} rows`;

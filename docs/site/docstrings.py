@@ -60,7 +60,7 @@ def _inline(block: str) -> str:
 
 
 def _words(line: str) -> str:
-    parts = line.split("`")
+    parts = line.replace("``", "`").split("`")
     plain = [_prose(part) for part in parts[::2]]
     code = [f"``{part}``" if part else "" for part in parts[1::2]]
     return "".join(a + b for a, b in zip(plain, [*code, ""], strict=False)) if len(parts) % 2 else _prose(line)

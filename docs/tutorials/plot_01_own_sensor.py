@@ -47,10 +47,21 @@ for row in slam.landmarks():
 # With a name in the configuration
 # --------------------------------
 #
-# A class with exact Jacobians is faster and has a name for ``kalmark run``: ``plugins: [my_sensors.py]`` and ``type:
-# tape`` in the configuration. Its fields are its keys, with bounds, unit (the end of the name) and a line of help.
+# A class with exact Jacobians is faster and has a name for ``kalmark run``. In a file ``my_sensors.py`` beside the
+# configuration it is used by
+#
+# .. code-block:: yaml
+#
+#    log: {path: my_log}
+#    plugins: [my_sensors.py]
+#    robots: {each: {motion: {type: unicycle}, sensors: {tape: {type: tape, sigma_m: 0.1}}}}
+#
+# Its fields are its keys, with bounds, unit (the end of the name) and a line of help.
 from typing import Annotated, ClassVar
 
+import numpy as np
+
+import kalmark as km
 from kalmark.declare import Positive
 
 

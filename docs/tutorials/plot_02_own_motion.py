@@ -69,3 +69,4 @@ from kalmark.models.model_check import check_model
 
 for finding in check_model(TwoTracks(), np.random.default_rng(0)):
     print(finding)
+plt.show()

@@ -56,3 +56,4 @@ for row in run.final_slam().landmarks():
     ax.plot(*km.geometry.ellipse(row.mean, row.covariance, sigmas=3, points=40).T, "C1")
 ax.set_aspect("equal")
 ax.legend()
+plt.show()

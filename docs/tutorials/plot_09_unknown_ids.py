@@ -33,3 +33,4 @@ for ax, (name, association) in zip(axes, choices.items(), strict=True):
     ax.plot(run.history.mean[:, 0], run.history.mean[:, 1])
     ax.set(title=f"{name}: {len(landmarks)} landmarks", aspect="equal")
     print(name, {key: told[key] for key in ("associated", "new", "deferred", "tentative", "ignored")})
+plt.show()

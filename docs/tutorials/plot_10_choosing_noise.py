@@ -40,10 +40,11 @@ ax.legend(title="stated noise of the range", loc="center right")
 # ----------------
 #
 # The page below has the beginning of that log, filtered with 81 noises. Move the sliders, or click the picture of the
-# likelihood. ``kalmark tune CONFIG --page sliders.html`` makes such a page of your own log.
+# likelihood. ``kalmark tune mine.yaml --log my_log --page sliders.html`` makes such a page of your own log.
 from kalmark.diagnosis.sliders import sliders
 
 sliders(world.config(), log, seconds=12.0)
+plt.show()
 
 # %%
 # Which part is wrong

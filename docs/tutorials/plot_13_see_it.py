@@ -34,6 +34,7 @@ for k in range(60):
     known = {"rover": true_path, **posts}
     km.draw(slam, axes[k // 30], truth=known, report=report, path=path, labels=True)  # here: after 30 and 60 scans
 fig.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+plt.show()
 
 # %%
 # In a notebook ``fig.canvas.draw()``, or ``plt.pause(0.01)`` in a window, after ``km.draw`` shows each step;

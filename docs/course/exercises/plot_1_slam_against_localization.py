@@ -59,6 +59,7 @@ for name, seconds in times.items():
     ax.loglog(sizes, np.array(seconds) * 1e3, "o-", label=name)
 ax.set(xlabel="landmarks N", ylabel="time [ms]")
 ax.legend()
+plt.show()
 
 # %%
 # Try changing

@@ -48,6 +48,7 @@ axes[1].plot(*second[:2], "w^")
 axes[1].plot(*km.geometry.ellipse(p, C, sigmas=2, points=60).T, "r")
 figure.colorbar(image, ax=axes, label="scaled density")
 print("intersection", p.round(2), "sigmas", np.sqrt(np.linalg.eigvalsh(C)).round(2), "m")
+plt.show()
 
 # %%
 # Try changing

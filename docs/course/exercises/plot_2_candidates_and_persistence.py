@@ -52,6 +52,7 @@ for ax, some in zip(axes, (found, candidates), strict=True):
         ax.text(*(p - [0, 0.7]), *map(str, persistence or [""]))
     ax.plot(*landmarks.T, "k+", *np.array(poses)[:, :2].T, "b^", ms=10)
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=(-1, 12), ylim=(-1, 8))
+plt.show()
 
 # %%
 # Try changing

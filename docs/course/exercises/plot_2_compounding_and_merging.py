@@ -58,6 +58,7 @@ names, values = [*ways, "parallel", "merged"], [*variances, parallel, M[2, 2]]
 bars.barh(names, values, color=["C0", "C1", "C7", "k"])
 bars.set(xlabel="variance of the heading [rad²]")
 figure.set_layout_engine("constrained")
+plt.show()
 
 # %%
 # Try changing

@@ -61,6 +61,7 @@ for values, name in ((gain, "gain"), (own, "covariance"), (crosses, "cross-covar
     ax.loglog(C, values, "o-", ms=4, label=name)
 ax.set(xlabel="C", ylabel="largest difference")
 ax.legend()
+plt.show()
 
 # %%
 # Try changing

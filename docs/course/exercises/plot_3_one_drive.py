@@ -58,6 +58,7 @@ for ax, step in zip(axes, (0, 12, 39), strict=False):
     ax.set_xticklabels(["r", 0, 1, 2, 3, 4, 5])
 axes[3].semilogy(off)
 axes[3].set(xlabel="step", title="difference of the poses")
+plt.show()
 
 # %%
 # Try changing

@@ -58,6 +58,7 @@ for robot in robots:
     ax.plot(*r[:2], "k", marker=f"${robot.name}$", ms=10)
     ax.plot(*km.geometry.ellipse(r[:2], P[:2, :2], sigmas=3, points=60).T, "k", lw=1)
 ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+plt.show()
 
 # %%
 # Try changing

@@ -51,6 +51,7 @@ for k, (text, depth) in enumerate(rows):
         ax.plot([depth - 0.9, depth - 0.9, depth], [-up, -k, -k], "0.5", lw=1, zorder=0)
 ax.set(xlim=(-0.2, 4.3), ylim=(-len(rows), 1))
 ax.axis("off")
+plt.show()
 
 # %%
 # Try changing

@@ -57,6 +57,7 @@ for ax, P, title in zip(axes, (before, moved, corrected), titles, strict=True):
     ax.set_xticks(range(9), labels)
     ax.set_yticks(range(9), labels)
     print(f"{title}: sigmas of the robot {np.sqrt(np.diag(P)[:3]).round(3)}")
+plt.show()
 
 # %%
 # Try changing

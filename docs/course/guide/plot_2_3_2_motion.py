@@ -54,6 +54,7 @@ labels = ["x", "y", "θ", "l₁", "", "l₂", "", "l₃", ""]
 for ax, title in zip(axes, ("x", "P: touched", "P: size of the change"), strict=True):
     ax.set(title=title, yticks=range(9), yticklabels=labels)
     ax.set_xticks([] if title == "x" else range(9), [] if title == "x" else labels)
+plt.show()
 
 # %%
 # Try changing

@@ -60,6 +60,7 @@ for ax, (title, picture) in zip(axes, pictures.items(), strict=True):
     ax.imshow(np.sqrt(picture), cmap="Greys", vmin=0, vmax=1.4 * np.sqrt(picture.max()))
     ax.set(title=title, yticks=range(9), yticklabels=labels)
     ax.set_xticks(range(len(picture.T)), ["r", "b"] if title == "K" else labels)
+plt.show()
 
 # %%
 # Try changing

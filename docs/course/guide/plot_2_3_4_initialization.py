@@ -53,6 +53,7 @@ for name, cov in terms.items():
     axes[2].plot(*km.geometry.ellipse(l, cov, sigmas=3, points=60).T, label=name)
 axes[2].set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 axes[2].legend(loc="upper left", bbox_to_anchor=(1, 1))
+plt.show()
 
 # %%
 # Try changing

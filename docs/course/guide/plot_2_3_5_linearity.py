@@ -50,6 +50,7 @@ for ax, (f, sigma) in zip(axes, ((line, 0.7), (parallax, 0.2), (parallax, 0.7)),
     other.set_xticks([])
     print(f"{f.__name__} {sigma}: mean {draws.mean():.3f}, first-order {y[0]:.3f}")
 axes[0].set_ylabel("f(d) [rad]")
+plt.show()
 
 # %%
 # What the pictures show

@@ -12,7 +12,7 @@ measurement is its bearing, [S] (52):
    v \propto \rho\, (p_0 - t) + \begin{bmatrix} \cos\alpha \\ \sin\alpha \end{bmatrix}, \qquad
    y = \operatorname{atan2}(v_2, v_1) - \theta
 
-(52) is printed with the arctangent of a quotient, which loses the side of a landmark behind the sensor.
+Equation (52) is printed with the arctangent of a quotient, which loses the side of a landmark behind the sensor.
 """
 
 # %%
@@ -52,6 +52,7 @@ for row, (name, (mean, sigma, to_rho)) in zip(axes, filters.items(), strict=True
         near = np.mean(np.abs(x - truth) < 3 * np.sqrt(P))
         ax.set(title=f"{distance} m: {near:.0%} within 3σ", ylabel=name)
 figure.supxlabel("baseline [m]")
+plt.show()
 
 # %%
 # What the pictures show

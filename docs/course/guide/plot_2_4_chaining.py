@@ -61,6 +61,7 @@ for kind, mark in zip(changes, ("|", ".", "^", "v"), strict=True):
     ax.plot(at, numbers[at], mark, label=f"{kind}: {len(at)}")
 ax.set(xlabel="event", ylabel="numbers in x")
 ax.legend()
+plt.show()
 
 # %%
 # Try changing

@@ -50,6 +50,7 @@ ax.annotate("t", t / 2 + np.array([-0.1, 0.15]), color="C3", size=14)
 ax.plot(*p_W, "o", color="C2")
 ax.annotate("p", p_W + 0.1, color="C2", size=14)
 ax.set(aspect="equal", xlim=(-0.8, 4), ylim=(-0.6, 4), xlabel="x [m]", ylabel="y [m]")
+plt.show()
 
 # %%
 # Try changing

@@ -50,6 +50,7 @@ ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 ax.legend(loc="lower right")
 inside = [km.geometry.mahalanobis(r[:2], slam.x[:2], slam.P[:2, :2]) < 2 for r in robots]
 print(f"inside two sigmas at the end: {np.mean(inside):.0%}; of a Gaussian: 86%")
+plt.show()
 
 # %%
 # Try changing

@@ -10,7 +10,7 @@ they are the two observation models of the course, [S] (63) and (64):
    y = \operatorname{polar}(\operatorname{toFrame}(\mathcal F, p)), \qquad
    p = \operatorname{fromFrame}(\mathcal F, \operatorname{rectangular}(y))
 
-(64) is printed with the superscript :math:`\mathcal R` on the polar point, which has to be :math:`\mathcal F`.
+Equation (64) is printed with the superscript :math:`\mathcal R` on the polar point, which has to be :math:`\mathcal F`.
 """
 
 # %%
@@ -45,6 +45,7 @@ for ax, (name, sigmas) in zip(axes, sensors.items(), strict=True):
     ax.plot(*r[:2], "k", marker=(3, 0, np.degrees(r[2]) - 90), ms=14)
     ax.set(title=name, aspect="equal", xlabel="x [m]", xlim=(0, 6), ylim=(0, 7))
 axes[0].set_ylabel("y [m]")
+plt.show()
 
 # %%
 # Try changing

@@ -54,6 +54,7 @@ for k, (name, f) in enumerate(functions.items()):
     print(f"E[{name}]: integral {exact:.4f}, average of 5000 draws {running[-1]:.4f}")
 right.set(xlabel="number of draws", ylabel="average")
 right.legend()
+plt.show()
 
 # %%
 # Try changing

@@ -42,6 +42,7 @@ for ax, (name, F) in zip(axes, matrices.items(), strict=True):
     ax.plot(*y, "k+", ms=10)
     ax.set(title=name, aspect="equal", xlabel="y₁")
 axes[0].set_ylabel("y₂")
+plt.show()
 
 # %%
 # What the pictures show

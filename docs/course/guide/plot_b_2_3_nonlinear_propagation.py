@@ -44,6 +44,7 @@ for ax, degrees in zip(axes, (2, 15, 45), strict=True):
     ax.set(title=f"bearing ± {degrees}°", aspect="equal", xlabel="x [m]")
     print(f"{degrees:2d} degrees: mean of x {y[0]:.3f} m, in truth {true[0]:.3f} m")
 axes[0].set_ylabel("y [m]")
+plt.show()
 
 # %%
 # What the pictures show

@@ -57,6 +57,7 @@ for k, (ax, points, title) in enumerate(zip(axes, steps, titles, strict=True)):
     ax.set(title=title, aspect="equal", xlim=(-2, 5.2))
 half = np.sqrt(np.diag(P))
 axes[3].add_patch(plt.Rectangle(mean - half, *(2 * half), fill=False, ls="--", ec="0.5"))
+plt.show()
 
 # %%
 # Try changing

@@ -51,6 +51,7 @@ right.axvline(3, color="k", ls=":")
 right.set(xlabel="n", ylabel="probability inside n sigmas")
 right.legend()
 print("Table 3:", (100 * km.geometry.sigma_table()).round(2), sep="\n")
+plt.show()
 
 # %%
 # Try changing

@@ -60,6 +60,7 @@ def draw(step):
 
 
 animation = FuncAnimation(figure, draw, frames=range(3, 200, 8), interval=240)
+plt.show()
 
 # %%
 # Try changing

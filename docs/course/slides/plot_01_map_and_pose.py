@@ -57,6 +57,7 @@ axes[0].plot(*np.transpose(placed), ".", ms=3, color="tab:red", label="observati
 for at in (slice(3 + 2 * i, 5 + 2 * i) for i in numbers.values()):
     axes[1].plot(*km.geometry.ellipse(slam.x[at], slam.P[at, at], sigmas=3).T, "tab:red")
 axes[0].legend(loc="center")
+plt.show()
 
 # %%
 # Try changing

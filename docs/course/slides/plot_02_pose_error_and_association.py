@@ -50,6 +50,7 @@ for low, high in ((0, 6), (6, 12), (12, 18)):
     share.plot(deltas, wrong[:, chosen].mean(axis=1), label=f"{low} m to {high} m")
 share.set(xlabel="error of the heading [rad]", ylabel="share of wrong pairs")
 share.legend()
+plt.show()
 
 # %%
 # Try changing

@@ -58,6 +58,7 @@ ax.semilogy(sizes, every, "o-", label="all")
 ax.semilogy(sizes, gated, "o-", label="inside the gates of 99 %")
 ax.set(xlabel="observations = landmarks", ylabel="matchings", xticks=sizes[1::2])
 ax.legend()
+plt.show()
 
 # %%
 # Try changing

@@ -54,6 +54,7 @@ for ax, gets, title in zip(axes, (0, 1), ("no mistake", "one mistake"), strict=T
         ax.plot(*km.geometry.ellipse(slam.x[at], slam.P[at, at], sigmas=3).T, "tab:red")
     ax.plot(*landmarks.T, "k+", ms=10)
     ax.set(title=title, aspect="equal", xlabel="x [m]", ylabel="y [m]")
+plt.show()
 
 # %%
 # Try changing

@@ -56,6 +56,7 @@ turns, start = np.logspace(-14, 0, 120), np.array([0, 0, 1.0])
 apart = [np.linalg.norm(arc(start, 2.0, each) - printed(start, 2.0, each)) for each in turns]
 error.loglog(turns, np.maximum(apart, 1e-17), ".")
 error.set(xlabel="turn [rad]", ylabel="difference of the end [m]")
+plt.show()
 
 # %%
 # Try changing

@@ -65,6 +65,7 @@ for ax, (f, mean) in zip(axes, cases, strict=True):
     ax.plot(*km.geometry.ellipse(y, Y, sigmas=2, points=60).T, "tab:red")
     ax.set(title=f"{f.__name__}: {np.mean(inside):.0%} inside", xlabel="first number [m]")
 axes[0].set(ylabel="second number [rad], [m], [rad]")
+plt.show()
 
 # %%
 # Try changing

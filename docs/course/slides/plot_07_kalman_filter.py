@@ -53,6 +53,7 @@ axes[0].plot(*np.transpose(measured), "r.", label="measurements")
 axes[0].legend()
 axes[0].set_ylabel("position [m]")
 axes[1].set(xlabel="t [s]", ylabel="speed [m/s]")
+plt.show()
 
 # %%
 # Try changing

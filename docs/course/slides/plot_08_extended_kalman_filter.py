@@ -66,6 +66,7 @@ for ax, (x, s, truth) in zip(axes, shown, strict=True):
 axes[0].set(ylabel="angle [rad]")
 axes[1].set(xlabel="t [s]", ylabel="rate [rad/s]")
 axes[1].legend(loc="upper right")
+plt.show()
 
 # %%
 # Try changing

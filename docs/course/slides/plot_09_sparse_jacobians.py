@@ -69,6 +69,7 @@ figure, axes = plt.subplots(1, 4, figsize=(10, 3.4), width_ratios=[13, 2, 13, 8]
 for ax, (name, J) in zip(axes, pictures.items(), strict=True):
     ax.imshow(np.abs(J) ** 0.3, cmap="Greys")
     ax.set(title=name, xticks=[], yticks=[])
+plt.show()
 
 # %%
 # Try changing

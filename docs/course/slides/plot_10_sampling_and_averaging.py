@@ -52,6 +52,7 @@ for ax, (title, some) in zip(axes, shown.items(), strict=True):
     ax.plot(*landmarks.T, "k+", *km.geometry.ellipse([0, 0], prior, 2, 40).T, "k:", ms=12)
     ax.set(title=title, aspect="equal", xlabel="x [m]", xlim=(-0.8, 1.7))
 axes[2].plot(*km.geometry.ellipse(x, P, 2, 40).T, "tab:red")
+plt.show()
 
 # %%
 # Try changing

@@ -65,6 +65,7 @@ for ax, (name, Sigma) in zip(axes, pictures.items(), strict=True):
     ax.imshow(np.sqrt(np.abs(Sigma)), cmap="Greys")
     ax.set(title=name, xticks=range(5), xticklabels=["x", "y", "θ", "u", "v"])
     ax.set_yticks(range(5), ["x", "y", "θ", "u", "v"])
+plt.show()
 
 # %%
 # Try changing

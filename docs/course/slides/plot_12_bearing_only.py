@@ -55,6 +55,7 @@ for ax, (name, (distance, spread)) in zip(axes, priors.items(), strict=True):
     ax.plot(*first.T, "C1", *last.T, "C0")
     ax.plot(*landmark, "k+", ms=12)
     ax.set(title=f"{name}: {np.mean(near):.0%} within 3σ", xlabel="x [m]")
+plt.show()
 
 # %%
 # What the pictures show

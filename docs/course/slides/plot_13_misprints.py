@@ -49,6 +49,7 @@ ax.plot(*printed.T, "x", color="tab:red", label="as printed")
 ax.plot(*pose[:2], "b^", label="robot")
 ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
 ax.legend(loc="upper left", bbox_to_anchor=(1, 1))
+plt.show()
 
 # %%
 # Try changing

@@ -7,10 +7,10 @@ settings are a *world*, a file of text. On the command line the four steps are
 
 .. code-block:: console
 
-   kalmark worlds thick_cloister_pinhole > mine.yaml
-   kalmark simulate mine.yaml --out log
-   kalmark run log/config.yaml --log log
-   kalmark view out/log
+   kalmark worlds thick_cloister_pinhole > cloister.yaml
+   kalmark simulate cloister.yaml --out log
+   kalmark run log/config.yaml --out out/cloister
+   kalmark view out/cloister
 
 All lessons of this chapter use the same simulation: the toolbox's cloister of two storeys, a robot on a circle, a
 camera."""
@@ -61,6 +61,7 @@ for k, axis in enumerate("xyz"):
     error.plot(run.history.t_s, 3 * sigma[:, [k, k]] * [1, -1], f"C{k}", lw=0.5)
 error.set(xlabel="t [s]", ylabel="error of the position [m]")
 error.legend()
+plt.show()
 
 # %%
 # Try changing

@@ -52,6 +52,7 @@ kinds.legend()
 t, *rows = np.array(sigmas).T
 mount.semilogy(t, np.transpose(rows))
 mount.set(xlabel="t [s]", title="sigmas of the mount [m], [rad]")
+plt.show()
 
 # %%
 # Try changing

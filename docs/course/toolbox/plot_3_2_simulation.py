@@ -35,6 +35,7 @@ for k, (name, world) in enumerate(worlds.items()):
     raw = log.events[-1].y
     image.plot(*np.reshape(raw, (len(raw), -1, 2)).T, "C3.-", ms=4, lw=1)
     image.set(xlim=(0, 640), ylim=(480, 0), xlabel="u [px]", ylabel="v [px]")
+plt.show()
 
 # %%
 # What the pictures show

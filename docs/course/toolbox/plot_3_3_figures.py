@@ -44,6 +44,7 @@ image.set(xlim=(0, 640), ylim=(480, 0), aspect="equal", xlabel="u [px]", ylabel=
 # last scan with its associations.
 figure, ax = plt.subplots(figsize=(9, 6), layout="constrained")
 km.draw(slam, ax, truth=log, report=report)
+plt.show()
 
 # %%
 # Try changing

@@ -51,6 +51,7 @@ ax.text(*p_world, "p")
 ax.set(xlim=(0, 5), ylim=(-0.5, 3), zlim=(0, 1.8), zticks=[0, 1], xlabel="x [m]", ylabel="y [m]")
 ax.set(aspect="equal")
 ax.view_init(40, -75)
+plt.show()
 
 # %%
 # Try changing

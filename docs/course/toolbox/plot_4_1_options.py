@@ -42,6 +42,7 @@ for setting, changes in settings.items():
 error.set(xlabel="t [s]", ylabel="error of the position [m]")
 error.legend()
 used.set(xlabel="corrections by a landmark")
+plt.show()
 
 # %%
 # What the pictures show

@@ -43,6 +43,7 @@ try:
     load_world("random_field", ["robots.rover.motion.type=hover"])
 except km.KalmarkError as error:
     print(error)
+plt.show()
 
 # %%
 # What the picture shows

@@ -41,6 +41,7 @@ for ax, (name, camera) in zip(axes.flat, cameras.items(), strict=True):
     ax.plot(*e.T, ".", ms=3)
     width, height = camera.image
     ax.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=name)
+plt.show()
 
 # %%
 # What the pictures show

@@ -44,6 +44,7 @@ for kind in ("inverse_depth", "anchored_homogeneous", "homogeneous"):
 error.set(xlabel="t [s]", ylabel="error of the position [m]")
 spread.set(xlabel="t [s]", ylabel="sigma of the position [m]")
 error.legend()
+plt.show()
 
 # %%
 # What the pictures show
