@@ -783,7 +783,7 @@ def structure() -> Iterator[Figure]:
     ):
         yield Figure("Structure", name, wanted, "python benchmarks/structure.py", row(f"{name}:", "{0}"))
     yield Figure("Structure", "the check of a change from nothing, with the site, 2 cores", "30 min; without the site 20",
-                 ".ci/run", row("all of it:", "{0} s"))  # fmt: skip
+                 "bash .ci/run", row("all of it:", "{0} s"))  # fmt: skip
     yield Figure("Structure", "items of the four documents: work / partly / missing", "all but the particle filter",
                  "python docs/site/course_pages.py", row("items:", "{0} / {2} / {4}"))  # fmt: skip
     before = "python benchmarks/{} be0e13e"

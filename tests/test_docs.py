@@ -162,7 +162,7 @@ def test_the_program_of_a_figure_exists(command: str) -> None:
     if words[:3] == ["python", "-m", "pytest"]:
         tests = [(file.name, file.read_text()) for file in (ROOT / "tests").rglob("test_*.py")]
         assert any(words[-1] in name or re.search(rf"def test_\w*{words[-1]}", text) for name, text in tests), words[-1]
-    elif words[0] == "python":
+    elif words[0] in ("python", "bash"):
         assert (ROOT / words[1]).is_file()
     else:
         shipped = {path.stem for path in (ROOT / "src" / "kalmark" / "configs").rglob("*.yaml")}
