@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from browser import said_by_page
 from kalmark.association import ByIdentity
 from kalmark.cli.shared import print_summary
 from kalmark.events import Control, Event, Fix, Scan
@@ -145,14 +144,8 @@ addEventListener("load", () => setTimeout(() => {
 
 
 def test_the_page_goes_step_by_step_with_its_slider_in_sight(run: Run, tmp_path: Path) -> None:
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no chromium to open the page with")
-    (tmp_path / "page.html").write_text(report_html(run).replace("</body>", STEPPED))
-    options = ["--headless", "--no-sandbox", "--window-size=1280,800", "--virtual-time-budget=8000", "--dump-dom"]
-    command = [chromium, *options, f"file://{tmp_path}/page.html"]
-    page = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False).stdout
-    said = json.loads(re.search(r"<title>({.*?})</title>", page)[1])
+    page = report_html(run).replace("</body>", STEPPED)
+    said = said_by_page(page, tmp_path, "--window-size=1280,800", "--virtual-time-budget=8000")
     assert said["inSight"]
     count, times = len(run.history.t_ns), run.history.t_s
     for (text, points), step in zip(said["shown"], (count, count - 1, count - 2, count - 1, count), strict=True):

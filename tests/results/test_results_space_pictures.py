@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from browser import said_by_page
 from kalmark.errors import RunError
 from kalmark.results.history import Camera
 from kalmark.results.landmark_table import EUCLIDEANS, LINES, OTHERS, shapes
@@ -225,23 +224,13 @@ setTimeout(() => {
 
 
 def test_the_page_turns_under_the_mouse_and_stays_turned_when_time_moves_on(run: Run, tmp_path: Path) -> None:
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no chromium to open the page with")
-    (tmp_path / "page.html").write_text(report_html(run).replace("</body>", TURNED))
-    options = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--dump-dom"]
-    command = [
-        chromium,
-        *options,
-        "--window-size=1300,1500",
-        "--virtual-time-budget=15000",
-        f"file://{tmp_path}/page.html",
-    ]
-    page = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False).stdout
-    found = re.search(r"<title>({.*?})</title>", page)
-    if found is None:
+    page, drawing = (
+        report_html(run).replace("</body>", TURNED),
+        ("--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    )
+    said = said_by_page(page, tmp_path, *drawing, "--window-size=1300,1500", "--virtual-time-budget=15000")
+    if said is None:
         pytest.skip("this chromium draws nothing in three dimensions")
-    said = json.loads(found[1])
     before, turned, after = (np.array([eye[axis] for axis in "xyz"]) for eye in said["seen"])
     assert np.linalg.norm(turned - before) > 0.3
     np.testing.assert_allclose(after, turned, atol=1e-6)

@@ -78,8 +78,7 @@ def record(
     summary has `diverged`.  `config` is what to save as the run's configuration; by default it is read off the filter's
     models.  Without `pictures` the maps on the way and what was in view are left out, which is faster; the verdict
     on such a run is without the map before a jump.  Each of the `observers` is called with each event and its report.
-    Raises LogError if the log has other columns than the filter's
-    motions and sensors, or two units of time.
+    Raises LogError if the log has other columns than the filter's motions and sensors, or two units of time.
 
     >>> rover = km.Robot("rover", km.motion.Unicycle())
     >>> drive = [km.Control(t_s=0.1 * k, robot="rover", u=(0.5, 0.02)) for k in range(4)]
