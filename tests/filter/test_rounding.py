@@ -138,3 +138,25 @@ def test_a_first_scan_from_anywhere_leaves_a_covariance(world: Any, estimator: A
             assert [o.outcome for o in report.observations] == ["associated"] * 6
             P = slam.covariance("r", *range(6))
             assert (P.diagonal() > 0).all() and not fault_of(P)
+
+
+def test_covariances_that_elimination_accepts_have_no_negative_eigenvalue_and_are_symmetric() -> None:
+    rng, accepted = np.random.default_rng(5), 0
+    for margin in (-1e-10, 1e-10):
+        for _ in range(400):
+            n = int(rng.integers(1, 5))
+            Q, last = np.linalg.qr(rng.normal(size=(n, n)))[0], rng.choice([1, -1]) * 10.0 ** rng.uniform(-13, -1)
+            S = (Q * np.append(10.0 ** rng.uniform(-2, 0, n - 1), last)) @ Q.T
+            S = 0.5 * (S + S.T) + rng.choice([0.0, 1e-6]) * np.triu(rng.normal(size=(n, n)), 1)
+            unit = np.sqrt(np.maximum(np.diag(S), 1e-20))
+            S, sigma = S / unit / unit[:, None], 10.0 ** rng.uniform(-6, 3, n)
+            least, skewed = np.linalg.eigvalsh(S)[0], np.abs(S - S.T).max()
+            if kernels.are_covariances((S * sigma * sigma[:, None])[None], margin):
+                accepted += 1
+                assert least > -margin - 1e-13 and skewed <= 1e-10
+            else:  # what is clearly a covariance is accepted
+                assert least < 1e-9 or skewed > 0.99e-10
+    assert accepted > 200
+    none = np.array([[[1.0, 1e-6], [1e-6, 0.0]]])  # nothing is correlated with a variance of zero
+    assert not kernels.are_covariances(none, 1e-10)
+    assert kernels.are_covariances(np.zeros((1, 2, 2)), 1e-10)

@@ -99,8 +99,8 @@ def test_the_chance_of_equal_numbers_is_that_of_gaussian_noise() -> None:
     y: Array = np.round(sigma * rng.normal(size=(20000, 1)) / q) * q
     given = LastMeasurement.of(y[:1], None)
     equal = np.mean([given.take(one[None], None) for one in y[1:]])
-    assert given.chance == pytest.approx(q / (2.0 * sigma * np.sqrt(np.pi)), rel=0.2)
-    assert given.chance == pytest.approx(equal, rel=0.2)
+    assert given.chance() == pytest.approx(q / (2.0 * sigma * np.sqrt(np.pi)), rel=0.2)
+    assert given.chance() == pytest.approx(equal, rel=0.2)
     assert pytest.approx(0.2114, abs=1e-4) == CHANCE
 
 

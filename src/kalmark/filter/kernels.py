@@ -1,7 +1,7 @@
 """The compiled linear algebra of the map: P is the lower triangle of a square buffer, its upper triangle is never read.
 
 Every function works on the rows of the blocks it is given; no Jacobian of the size of the map is ever formed.
-Rank-k updates go through BLAS (dsyrk): in C order our lower triangle is Fortran's upper one.
+Rank-k updates go through BLAS (dgemm): in C order our matrices are Fortran's transposed ones.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ def _routine(module: str, name: str, arguments: int) -> Any:
     return types.ExternalFunction(f"kalmark_{name}", types.void(*[types.intp] * arguments))
 
 
-_dsyrk = _routine("cython_blas", "dsyrk", 10)
 _dgemm = _routine("cython_blas", "dgemm", 13)
 _dpotrf = _routine("cython_lapack", "dpotrf", 5)
 _UPPER_NO = np.array([ord("U"), ord("N")], dtype=np.uint8)
 _TRANS_NO = np.array([ord("T"), ord("N"), ord("T")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
-CACHED = 256  # rows of a covariance that stays in a cache between one pass over it and the next
-BAND = 128  # rows of a larger one that do
+CACHED = 512  # rows of a covariance that stays in a cache between one pass over it and the next
+BAND, NARROW = 128, 32  # rows of a larger one that do, and rows of a smaller one that are corrected at once
 TILE = 64  # rows of a tile of which two do
 FEW = 8  # rows of a factor whose product takes less time without BLAS
 
 # What rounding may take off a variance: with these a covariance stays one where 1e-5 rad are beside metres
 KEPT = 2.0**-50  # of what a variance loses to a correction, and of the terms that a prediction adds up
 RAISED = 2.0**-44  # of the variance of an innovation
+LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
 
 
 def one_thread() -> Any:
@@ -231,52 +231,26 @@ def downdate(P: Array, V: Array) -> None:
 
     The variances keep `KEPT` of what they lose.
     """
-    q, n = V.shape
     keep_some(P, V)
-    if n <= CACHED:  # where a call of BLAS takes longer
-        none = np.empty((0, n))
-        subtract_squares(P, V, none, none)
-        return
-    sizes = np.array([n, q, P.shape[1]], dtype=np.int32)
-    at = sizes.ctypes.data
-    chars, numbers = _UPPER_NO.ctypes.data, _MINUS_ONE_ONE.ctypes.data
-    _dsyrk(chars, chars + 1, at, at + 4, numbers, V.ctypes.data, at, numbers + 8, P.ctypes.data, at + 8)
-    sizes[0] = V.shape[0]  # keeps both alive until the call is over
+    subtract_symmetric(P, V, V)
 
 
 @compiled
-def subtract_squares(P: Array, V: Array, a: Array, w: Array) -> None:
-    """P <- P - V' V + a' w + w' a on the lower triangle, V (q, n), a and w (axes, n): by two rows of P and four of V.
+def subtract_symmetric(P: Array, L: Array, R: Array) -> None:
+    """P (n, n) <- P - L' R on the lower triangle, for L and R (q, n) whose product is symmetric.
 
-    It writes to the right of the diagonal of P, too.
+    By bands of rows, through BLAS: so narrow while P is small that its threads, which would cost more than they save,
+    are not asked for.  It writes to the right of the diagonal, too.
     """
-    q, n = V.shape
-    odd = n % 2
-    for k in range(q * odd):
-        P[0, 0] -= V[k, 0] * V[k, 0]
-    for c in range(len(a) * odd):
-        P[0, 0] += 2.0 * a[c, 0] * w[c, 0]
-    for i in range(odd, n, 2):
-        k = 0
-        while k + 4 <= q:
-            a_0, a_1, a_2, a_3 = V[k, i], V[k + 1, i], V[k + 2, i], V[k + 3, i]
-            b_0, b_1, b_2, b_3 = V[k, i + 1], V[k + 1, i + 1], V[k + 2, i + 1], V[k + 3, i + 1]
-            for j in range(i + 2):
-                v_0, v_1, v_2, v_3 = V[k, j], V[k + 1, j], V[k + 2, j], V[k + 3, j]
-                P[i, j] -= a_0 * v_0 + a_1 * v_1 + a_2 * v_2 + a_3 * v_3
-                P[i + 1, j] -= b_0 * v_0 + b_1 * v_1 + b_2 * v_2 + b_3 * v_3
-            k += 4
-        while k < q:
-            a_0, b_0 = V[k, i], V[k, i + 1]
-            for j in range(i + 2):
-                P[i, j] -= a_0 * V[k, j]
-                P[i + 1, j] -= b_0 * V[k, j]
-            k += 1
-        for c in range(len(a)):
-            a_0, b_0, a_1, b_1 = a[c, i], a[c, i + 1], w[c, i], w[c, i + 1]
-            for j in range(i + 2):
-                P[i, j] += a_0 * w[c, j] + a_1 * a[c, j]
-                P[i + 1, j] += b_0 * w[c, j] + b_1 * a[c, j]
+    q, n = L.shape
+    if q == 0:
+        return
+    band = NARROW if n <= CACHED else BAND
+    for first in range(0, n, band):
+        last = min(first + band, n)
+        C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[1]
+        subtract_outer(C, P.shape[1], here, last - first, R.ctypes.data, last, q, n)
+    L[0, 0], R[0, 0] = L[0, 0], R[0, 0]  # keeps them alive until the calls are over
 
 
 @compiled
@@ -358,9 +332,6 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: Index) -> None:
             for j in range(n):
                 w[c, j] -= v * V[i, j]
     add_half_turn(w, a_T, theta)
-    if n <= CACHED:
-        subtract_squares(P, V, a_T, w)
-        return
     L, R = np.empty((q + 2 * axes, n)), np.empty((q + 2 * axes, n))
     for i in range(len(L)):
         for j in range(n):
@@ -370,11 +341,7 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: Index) -> None:
                 L[i, j], R[i, j] = -w[i - q, j], a_T[i - q, j]
             else:
                 L[i, j], R[i, j] = -a_T[i - q - axes, j], w[i - q - axes, j]
-    for first in range(0, n, BAND):
-        last = min(first + BAND, n)
-        C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[1]
-        subtract_outer(C, P.shape[1], here, last - first, R.ctypes.data, last, len(L), n)
-    L[0, 0], R[0, 0] = 0.0, 0.0  # keeps them alive until the calls are over
+    subtract_symmetric(P, L, R)
 
 
 @compiled
@@ -410,6 +377,35 @@ def cholesky_inverse(S: Array) -> tuple[Array, bool]:
         for k in range(i + 1):
             M[i, k] = T[i, n + k]
     return M, True
+
+
+@compiled
+def are_covariances(S: Array, margin: float) -> bool:
+    """Return whether S (K, n, n), in units of their sigmas, are symmetric up to |margin| and S + margin 1 definite.
+
+    By Cholesky's pivots.  Nothing is said of a matrix that is near the limit: of it only the eigenvalues are sure.
+    """
+    n = S.shape[1]
+    sigma, L = np.empty(n), np.empty((n, n))
+    for C in S:
+        for i in range(n):
+            if C[i, i] < 0.0:
+                return False
+            sigma[i] = math.sqrt(max(C[i, i], LEAST_VARIANCE))
+            for j in range(i + 1):
+                s = C[i, j] / sigma[i] / sigma[j]
+                if not abs(s - C[j, i] / sigma[i] / sigma[j]) <= abs(margin):
+                    return False
+                s += margin if i == j else 0.0
+                for c in range(j):
+                    s -= L[i, c] * L[j, c]
+                if j < i:
+                    L[i, j] = s / L[j, j]
+                elif s > 0.0:
+                    L[i, i] = math.sqrt(s)
+                else:
+                    return False
+    return True
 
 
 @compiled

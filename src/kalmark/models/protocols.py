@@ -410,7 +410,7 @@ def parameter_names(sensor: object) -> tuple[str, ...]:
 
 def innovation_size(sensor: Sensor) -> int:
     """Return how many numbers an innovation has; by default as many as the measurement."""
-    return sensor.cov_size if isinstance(sensor, _InnovationSize) else len(sensor.columns)
+    return int(getattr(sensor, "cov_size", len(sensor.columns)))
 
 
 # ------------------------------------------------------------------ capabilities of sensors

@@ -10,10 +10,10 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError, ModelError
 from kalmark.events import MOST, Control, Fix, Scan, finite, is_number, label_of_event, refuse_huge, short_text
+from kalmark.filter import kernels
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, Motion, OwnNoise, Sensor, coasts, innovation_size
 
-LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
 MOST_OBSERVATIONS = 5000  # of one scan: a map of as many takes 2 GB, and a scan of all of them half a minute
 ROUNDING = 1e-3  # of a correlation
 SEMIDEFINITE = 1e-9  # in units of its own sigmas, by which rounding may take an eigenvalue below zero
@@ -77,9 +77,9 @@ def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[Kalma
     if skewed.any():
         raise error(f"{what} is {short_text(covs[np.argmax(skewed)].tolist())}, expected a symmetric matrix")
     variances = np.diagonal(covs, axis1=1, axis2=2)
-    sigma = np.sqrt(np.maximum(variances, LEAST_VARIANCE))  # in units of these: no large variance hides another
+    sigma = np.sqrt(np.maximum(variances, kernels.LEAST_VARIANCE))  # in units of these: no large variance hides another
     lowest = np.linalg.eigvalsh(covs / sigma[:, :, None] / sigma[:, None, :]).min(axis=1)
-    lowest[(variances < -LEAST_VARIANCE).any(axis=1)] = -np.inf
+    lowest[(variances < -kernels.LEAST_VARIANCE).any(axis=1)] = -np.inf
     bad = ~(lowest > 0) if definite else ~(lowest >= -SEMIDEFINITE)
     if bad.any():
         kind = "positive definite" if definite else "positive semidefinite"
@@ -91,7 +91,7 @@ def fault_of(P: Array) -> str:
     """Return what is wrong with a covariance (n, n) of the map, "" if nothing is but the rounding of its numbers."""
     if not np.isfinite(P).all():
         return "is not finite"
-    sigma = np.sqrt(np.maximum(P.diagonal(), LEAST_VARIANCE))
+    sigma = np.sqrt(np.maximum(P.diagonal(), kernels.LEAST_VARIANCE))
     lowest = float(np.linalg.eigvalsh(P / sigma / sigma[:, None])[0])
     return (
         f"is not positive semidefinite: in its own sigmas it has the eigenvalue {lowest:.3g}"
@@ -114,29 +114,33 @@ def check_numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -
 SMALLEST_BOUND = min(MOST.values())
 
 
-def refuse_vague(cov: Array, columns: tuple[str, ...], what: str) -> None:
-    """Refuse covariances (..., m, m) of these columns, of which a standard deviation is larger than means anything."""
-    if cov.size and cov.max() > SMALLEST_BOUND**2 and cov.shape[-1] == len(columns):
-        sigmas = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
-        refuse_huge(sigmas, tuple(f"sigma_{column}" for column in columns), f"{what}: cov")
+def _refuse_bad_noise(event: Control | Scan, covs: Array, columns: tuple[str, ...], *, definite: bool) -> None:
+    """Refuse the covariances (K, m, m) of an event that are none, or larger than any knowledge of these columns."""
+    margin = 0.1 * SEMIDEFINITE
+    if not kernels.are_covariances(covs, -margin if definite else margin):
+        _refuse_indefinite(covs, f"{label_of_event(event)}: cov", definite)
+    if event.vaguest > SMALLEST_BOUND**2 and covs.shape[-1] == len(columns):
+        sigmas = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))
+        refuse_huge(sigmas, tuple(f"sigma_{column}" for column in columns), f"{label_of_event(event)}: cov")
 
 
 def refuse_bad_control(event: Control, motion: Motion) -> None:
     """Refuse a control that is not of a motion's components, a part of one that is no increment, and bad noise."""
-    columns = motion.columns
+    columns, m = motion.columns, len(motion.columns)
     if event.share != 1.0 and (motion.held or coasts(motion)):
         rates = f"expected 1: the controls {', '.join(columns)} are no increments of a pose, and only these have parts"
         raise EventError(f"{label_of_event(event)}: share is {event.share:g}, {rates}")
-    if event.u.shape != (len(columns),):
+    if event.u.shape != (m,):
         raise EventError(f"{label_of_event(event)}: u has shape {event.u.shape}, expected ({', '.join(columns)})")
     if event.largest > SMALLEST_BOUND:
         refuse_huge(event.u, columns, label_of_event(event))
     if event.cov is not None:
-        check_covariance(event.cov, len(columns), f"{label_of_event(event)}: cov", definite=False)
-        refuse_vague(event.cov, columns, label_of_event(event))
+        if event.cov.shape != (m, m):
+            raise EventError(f"{label_of_event(event)}: cov has shape {event.cov.shape}, expected ({m}, {m})")
+        _refuse_bad_noise(event, event.cov[None], columns, definite=False)
     more = event.uneven
-    if more is not None and (event.share == 1.0 or more.shape != (len(columns),) or (more < 0.0).any()):
-        wanted = f"{len(columns)} variances, of a part of an increment: share below 1"
+    if more is not None and (event.share == 1.0 or more.shape != (m,) or (more < 0.0).any()):
+        wanted = f"{m} variances, of a part of an increment: share below 1"
         raise EventError(f"{label_of_event(event)}: uneven is {short_text(more.tolist())}, expected {wanted}")
 
 
@@ -170,7 +174,7 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
             raise EventError(f"{label_of_event(event)}: {event.robot}.{event.sensor}, {error}") from None
     if event.cov is None and not count:
         return np.zeros((0, m, m))
-    what, p = f"{label_of_event(event)}: cov", innovation_size(sensor)
+    p = innovation_size(sensor)
     if event.cov is None:
         R = np.asarray(sensor.noise(event.y), np.float64)  # one of whole numbers would be compiled for, too
         if np.shape(R) != (count, p, p) and not isinstance(sensor, OwnNoise):
@@ -178,9 +182,10 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
             raise EventError(f"{label_of_event(event)}: {event.robot}.{event.sensor}, {type(sensor).__name__}: {wrong}")
         return R
     if event.cov.shape not in ((p, p), (count, p, p)):
-        raise EventError(f"{what} has shape {event.cov.shape}, expected ({p}, {p}) or ({count}, {p}, {p})")
-    _refuse_indefinite(event.cov.reshape(-1, p, p), what, definite=True)
-    refuse_vague(event.cov, sensor.columns, label_of_event(event))
-    # a copy in order: one that cannot be written, or has another order, would be compiled for, too
-    covs = np.array(np.broadcast_to(event.cov, (count, p, p)), order="C")
+        expected = f"expected ({p}, {p}) or ({count}, {p}, {p})"
+        raise EventError(f"{label_of_event(event)}: cov has shape {event.cov.shape}, {expected}")
+    each = event.cov if event.cov.ndim == 3 else event.cov[None]
+    _refuse_bad_noise(event, each, sensor.columns, definite=True)
+    # written out: one that cannot be written, or has another order, would be compiled for, too
+    covs = each if len(each) == count else np.repeat(each, count, axis=0)
     return sensor.noise_from(event.y, covs) if isinstance(sensor, OwnNoise) else covs

@@ -25,6 +25,8 @@ AGAIN = "it repeats the one before to the last bit, though the robot has moved: 
 SELDOM = 0.01  # of new measurements may be taken for old ones
 MOVED = 0.99  # sure is it that a robot has moved
 CHANCE = math.exp(-0.5 * (np.euler_gamma + math.log(2.0))) / math.sqrt(2.0 * math.pi)  # of Gaussian noise: g is known
+TOGETHER = 32  # measurements of the same ids whose differences are counted at once
+NOTHING = np.zeros(0)
 SAME = 1e-9  # differences are rounding below it, as a share of a number
 
 
@@ -39,19 +41,20 @@ def record_repeated_reading(report: Report, ids: Sequence[Id | None], p: int, of
 class LastMeasurement:
     """The last measurement of a sensor, y (K, m) with its ids, and statistics of its numbers.
 
+    `recent` are the last ones of the same ids, y the last of them; differences between them are counted many at a time.
     Of each column: the `least` difference of successive measurements (0 of none), the sum of the logarithms of
     differences, and how many `differ` and are `equal`.  `went` and `doubt` (c,) are the controls since it was given and
     their variances.  `repeats` of `number` measurements were left out, since `since_ns`.
     """
 
-    y: Array
+    recent: list[Array]
     ids: tuple[Id | None, ...] | None
     least: Array
     logs: Array
     differ: Array
     equal: Array
-    went: Array = field(default_factory=lambda: np.zeros(0))
-    doubt: Array = field(default_factory=lambda: np.zeros(0))
+    went: Array = field(default_factory=lambda: NOTHING)
+    doubt: Array = field(default_factory=lambda: NOTHING)
     repeats: int = 0
     number: int = 1
     since_ns: int = 0
@@ -59,19 +62,24 @@ class LastMeasurement:
     @classmethod
     def of(cls, y: Array, ids: tuple[Id | None, ...] | None) -> LastMeasurement:
         """Return the record of a first measurement."""
-        m = y.shape[1]
-        return cls(y, ids, *np.zeros((4, m)))
+        return cls([y], ids, *np.zeros((4, y.shape[1])))
+
+    @property
+    def y(self) -> Array:
+        """The last measurement (K, m)."""
+        return self.recent[-1]
 
     def add_motion(self, part: MotionPart) -> None:
         """Add the motion of a part of a control, with its variances."""
-        u, N = (part.u * part.dt_s, part.N * part.dt_s**2) if part.dt_s > 0.0 else (part.u, part.N)
-        if len(self.went) != len(u):
-            self.went, self.doubt = np.zeros(len(u)), np.zeros(len(u))
-        self.went, self.doubt = self.went + u, self.doubt + np.diagonal(N)
+        u, variances = part.u, part.N.diagonal()
+        if part.dt_s > 0.0:
+            u, variances = u * part.dt_s, variances * part.dt_s**2
+        first = len(self.went) != len(u)
+        self.went, self.doubt = (u, variances) if first else (self.went + u, self.doubt + variances)
 
-    @property
     def chance(self) -> float:
-        """The probability that a new measurement has the same numbers, of the columns independently; 1 if unknown."""
+        """Return the probability that a new measurement has the same numbers, 1 if unknown; columns are independent."""
+        self._count()
         if not self.differ.any():
             return 1.0
         some = self.differ > 0
@@ -88,15 +96,28 @@ class LastMeasurement:
     def take(self, y: Array, ids: tuple[Id | None, ...] | None) -> bool:
         """Take a measurement; return whether it has the numbers of the one before."""
         self.number += 1
-        if y.shape == self.y.shape and ids == self.ids:
-            d = np.abs(y - self.y)
-            if not d.any():
+        if ids == self.ids and y.shape == self.y.shape:
+            if (y == self.y).all():
                 return True
-            new = d > SAME * np.abs(y)
-            least = np.where(new, d, np.inf).min(axis=0)
-            least = np.where(self.differ > 0, np.minimum(self.least, least), least)
-            self.least = np.where(new.any(axis=0), least, self.least)
-            self.logs += np.where(new, np.log(np.where(new, d, 1.0)), 0.0).sum(axis=0)
-            self.differ, self.equal = self.differ + new.sum(axis=0), self.equal + (~new).sum(axis=0)
-        self.y, self.ids, self.went, self.doubt = y, ids, np.zeros(0), np.zeros(0)
+            self.recent.append(y)
+            if len(self.recent) > TOGETHER:
+                self._count()
+        else:
+            self._count()
+            self.recent = [y]
+        self.ids, self.went, self.doubt = ids, NOTHING, NOTHING
         return False
+
+    def _count(self) -> None:
+        """Count the differences between the recent measurements."""
+        if len(self.recent) == 1:
+            return
+        y = np.array(self.recent)
+        d = np.abs(np.diff(y, axis=0)).reshape(-1, y.shape[2])
+        new = d > SAME * np.abs(y[1:]).reshape(d.shape)
+        least = np.where(new, d, np.inf).min(axis=0)
+        least = np.where(self.differ > 0, np.minimum(self.least, least), least)
+        self.least = np.where(new.any(axis=0), least, self.least)
+        self.logs = self.logs + np.where(new, np.log(np.where(new, d, 1.0)), 0.0).sum(axis=0)
+        self.differ, self.equal = self.differ + new.sum(axis=0), self.equal + (~new).sum(axis=0)
+        self.recent = self.recent[-1:]
