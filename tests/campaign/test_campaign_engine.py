@@ -100,7 +100,7 @@ def test_a_run_has_the_numbers_of_the_ordinary_path(case: str, tmp_path: Path) -
         ("two_robots", [], "ekf", "one robot of the plane"),
         ("thick_cloister", [], "ekf", "one robot of the plane"),
         ("cloister", [], "fej", "no estimator fej"),
-        ("loop_c", [], "invariant", "up to 80 landmarks"),
+        ("loop_c", ["world.count=200"], "invariant", "up to 193 landmarks"),
         ("cloister", ["ids=false"], "invariant", "known ids"),
         ("camera", [], "invariant", "ranges and bearings"),
         ("cloister", ["robots.robot.sensing={lidar: {outliers: 0.1}}"], "invariant", "no outliers"),

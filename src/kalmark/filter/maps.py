@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 
 from kalmark.errors import ModelError
 from kalmark.filter.compressed import restoring as compressed
@@ -13,7 +15,11 @@ from kalmark.filter.layout import Read, State
 from kalmark.filter.map import Map, StochasticMap
 from kalmark.geometry.spaces import RHO, Space
 
-DENSE = 80  # landmarks up to which the dense map is faster
+COUNTED = 100  # corrections whose costs are compared
+STEP = 3e6  # multiplications of a dense map that take as long as a compressed map takes more for a step
+ENTRY = 8e3  # of a block that becomes active, for each row of the map
+DENSE = int(math.sqrt(STEP / 20.0) / 2.0)  # points of the plane of which ten are observed: it never pays for fewer
+MOST = 1000  # landmarks of a dense map: 32 MB in the plane, and four times as much as soon as it grows
 MAPS = ("auto", "dense", "postponed")
 
 
@@ -28,9 +34,45 @@ def new_map(type_: str, numbers: str) -> Map:
     return CompressedMap(Triangle(NUMBERS[numbers])) if type_ == "postponed" else StochasticMap()
 
 
-def compress_if_large(map_: Map, landmarks: Iterable[Space], numbers: str) -> Map:
-    """Return a dense map as a compressed one where it pays: from DENSE landmarks on, inverse distances not counted."""
-    if not isinstance(map_, StochasticMap) or sum(RHO not in space.kinds for space in landmarks) <= DENSE:
+@dataclass
+class CostBalance:
+    """The costs of corrections in a dense map and in a compressed one, in multiplications, `COUNTED` at a time.
+
+    The active blocks of a compressed map would be those that are observed in this count or were in the last one.
+    `observed` has of each block, by its slot, the number of the count in which it was observed last; `active` blocks
+    were in this one, `before` in the last one.  `saved` is what a compressed map would save, `pays` whether it did.
+    """
+
+    observed: dict[int, int] = field(default_factory=dict)
+    number: int = 0
+    corrections: int = 0
+    active: int = 0
+    before: int = 0
+    saved: float = 0.0
+    pays: bool = False
+
+    def add_correction(self, slots: list[int], d: int, q: int, n: int) -> None:
+        """Count a correction of n rows by q numbers, in which blocks of d numbers are observed."""
+        entries = 0
+        for slot in slots:
+            last = self.observed.get(slot)
+            if last != self.number:
+                self.observed[slot] = self.number
+                self.active += 1
+                entries += last is not None and last < self.number - 1
+        rows = min(2 * d * max(self.active, self.before), n)  # with auxiliary states, as many
+        self.saved += q * (n**2 - rows**2) - STEP - entries * ENTRY * n
+        self.corrections += 1
+        if self.corrections == COUNTED:
+            self.pays = self.saved > 0.0 and self.number > 0  # in the first one all blocks are new
+            self.number, self.corrections, self.before = self.number + 1, 0, self.active
+            self.active, self.saved = 0, 0.0
+
+
+def compress_map(map_: Map, landmarks: Iterable[Space], numbers: str) -> Map:
+    """Return a map as a compressed one, unless most landmarks are inverse distances: these are always active."""
+    rays = [RHO in space.kinds for space in landmarks]
+    if not isinstance(map_, StochasticMap) or 2 * sum(rays) > len(rays):
         return map_
     return CompressedMap.from_dense(map_, Triangle(NUMBERS[numbers]))
 

@@ -56,4 +56,5 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     if report.gaps and fused.any():
         moving.held.located(event.t_ns)
     report.judged = (JudgedScan(range(len(ids)), ids, ids, done, channel.gate),)
+    state.let_grow()
     return report

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +12,8 @@ from kalmark.association import Association
 from kalmark.errors import DivergedError, MapError, ModelError
 from kalmark.events import Event, Id, label_of_event
 from kalmark.filter.estimators import Correction, Estimator, Initializing, Selective, Update
-from kalmark.filter.map import Map
-from kalmark.filter.maps import DENSE, compress_if_large, new_map
+from kalmark.filter.map import Map, StochasticMap
+from kalmark.filter.maps import MOST, CostBalance, compress_map, new_map
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
@@ -57,13 +57,14 @@ class State:
     `standing` are, of robots with detection of rest, the names of the sensors that do; `alternatives` are, of robots
     whose readings do not fit, the other explanations of these; `sums` are, of robots that may be in several places,
     their poses; `taken` are the events of this very time: the kind, the robot and the sensor of each; `given` is what
-    each sensor gave last.
+    each sensor gave last; `balance` decides whether a dense map is compressed.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
     t_ns: int | None
     taken: set[tuple[str, str, str]]
     map: Map
+    balance: CostBalance
     tracks: Tracks
     clones: Clones
     surveys: Surveys
@@ -77,7 +78,7 @@ class State:
 
     def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
         self.settings, self.robots, self.t_ns, self.taken, self.placed = settings, robots, None, set(), 0
-        self.map, self.tracks = new_map(settings.map, settings.numbers), Tracks(robots)
+        self.map, self.balance, self.tracks = new_map(settings.map, settings.numbers), CostBalance(), Tracks(robots)
         self.clones, self.surveys, self.given, self.alternatives, self.sums = Clones(), Surveys(), {}, {}, {}
         self.moving, self.sources, self.readers = {}, {}, {}
         self.channels: dict[ChannelKey, Channel] = {}
@@ -175,6 +176,14 @@ class State:
             raise
         return slots
 
+    def corrected_by(self, starts: Sequence[Start], update: Update) -> Correction:
+        """Add blocks, correct by an `update` of these, remove them again.  Raises MapError where the map is full."""
+        slots = self.add_all(starts)
+        done = self.estimator.correct(self.map, update._replace(slots=np.array(slots)))
+        for slot in slots:
+            self.map.remove(slot)
+        return done
+
     def clone(self, key: ChannelKey, t_ns: int) -> int:
         """Clone the pose of a channel's robot; return the clone's number.  Raises MapError where the map is full."""
         number = self.clones.now(key[0], t_ns)
@@ -216,7 +225,7 @@ class State:
         if given is None or given.y.shape[1] != y.shape[1]:
             self.given[key] = LastMeasurement.of(y, ids)
             return False
-        if not given.take(y, ids) or given.chance >= SELDOM:
+        if not given.take(y, ids) or given.chance() >= SELDOM:
             return False
         moving = self.moving[key[0]]
         pose, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
@@ -246,10 +255,10 @@ class State:
         self.tracks.remove(name)
 
     def let_grow(self) -> None:
-        """Compress the map from so many landmarks on that it pays; not where matchings are averaged."""
-        if self.may_grow and len(self.tracks.confirmed) > DENSE:
+        """Compress the map as soon as that pays; not where matchings are averaged."""
+        if self.may_grow and (self.balance.pays or len(self.tracks.confirmed) > MOST):
             spaces = (track.model.space for track in self.tracks.confirmed.values())
-            self.map = compress_if_large(self.map, spaces, self.settings.numbers)
+            self.map, self.balance.pays = compress_map(self.map, spaces, self.settings.numbers), False
 
     def is_there(self, name: Id) -> bool:
         """Return whether a name is that of a block, or of a landmark known exactly."""
@@ -258,6 +267,8 @@ class State:
     def corrected(self, update: Update, event: Event, estimator: Estimator | None = None) -> Correction:
         """Correct the map.  Raises DivergedError if the robot is lost for good."""
         done = (estimator or self.estimator).correct(self.map, update)
+        if self.may_grow and isinstance(self.map, StochasticMap):
+            self.balance.add_correction(update.slots.tolist(), update.d, done.z.size, self.map.n)
         if not done.valid:
             self.refuse_lost(event)
         return done
