@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,21 +36,6 @@ SLACK_M, SLACK_RAD = 0.3, 0.3  # by which covisible landmarks may miss, and by w
 GATE = 0.99
 EQUAL_M = 1e-4  # how equal two landmarks are made
 LINEAR = (VECTOR, VECTOR3, SCALAR)  # atoms of which a difference is one
-
-
-@dataclass(frozen=True, eq=False)
-class ZeroDifference:
-    """The observation model of a block that is a difference: it is observed to be zero, by a sensor on a mount."""
-
-    mount: Array
-    numbers: int
-
-    def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """Return e = l (K, n), z = y - e, E_h = 0 (K, n, h) and E_l = 1 (K, n, n)."""
-        count, n = l.shape
-        E_l = np.tile(np.eye(n), (count, 1, 1))
-        pose = 3 if len(self.mount) == 3 else 6
-        return l.copy(), y - l, np.zeros((count, n, pose * (len(head) // len(self.mount)))), E_l
 
 
 class Merge(NamedTuple):

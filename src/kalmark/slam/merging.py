@@ -10,11 +10,12 @@ import numpy as np
 
 from kalmark.errors import MapError
 from kalmark.events import Id
-from kalmark.filter.estimators import Correction, Update
+from kalmark.filter.estimators import Correction
 from kalmark.management import merge, wall_growth
 from kalmark.management import repeated_places as of_map
 from kalmark.models.protocols import Joining
 from kalmark.report import Repeat
+from kalmark.slam.factors import update_by_blocks
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
@@ -83,14 +84,9 @@ def make_equal(state: State, channel: Channel, robot: int, pairs: Sequence[tuple
     Raises MapError where the map is full.
     """
     starts = [_difference(state, pair) for pair in pairs]
-    slots = state.add_all(starts)
-    n, count = starts[0].space.size, len(slots)
-    model, R = merge.ZeroDifference(channel.at, n), np.tile(merge.EQUAL_M**2 * np.eye(n), (count, 1, 1))
-    update = Update(model, robot, channel.mount, np.array(slots), n, np.zeros((count, n)), R)
-    done = state.estimator.correct(state.map, update)
-    for slot in slots:
-        state.map.remove(slot)
-    return done
+    n, count = starts[0].space.size, len(starts)
+    R = np.tile(merge.EQUAL_M**2 * np.eye(n), (count, 1, 1))
+    return state.corrected_by(starts, update_by_blocks(robot, channel.mount, channel.at, np.zeros((count, n)), R))
 
 
 def _difference(state: State, pair: tuple[Id, Id]) -> Start:

@@ -55,6 +55,7 @@ from kalmark.slam.checks import check_covariance, instance, measurements, refuse
 from kalmark.slam.checks import check_numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
+from kalmark.slam.factors import correct_by_factor, factor_of
 from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy, refuse_other_world
 from kalmark.slam.replacing import NEEDED
@@ -428,6 +429,29 @@ class Slam(Estimate):
         state.tracks.enter(Track(name, model, state.map.add(model.space, mean, cov)))
         state.surveys.trial[name] = 0
         state.let_grow()
+
+    def fuse(
+        self, names: Sequence[Id], expect: Callable[..., Any], y: Any, cov: Any, *, angular: Sequence[bool] = (),
+        gate: float = 1.0,
+    ) -> Observation:  # fmt: skip
+        """Correct by a measurement y (p,) = h(x_1, ..., x_k) + v of any robots and landmarks.  docs/factors.md.
+
+        `expect` is h: it takes the means of the blocks `names`, as `mean` returns them, and returns the expectation
+        (p,).  Jacobians are taken by differences; a large correction is iterated.  `cov` (p, p) is the covariance of v,
+        `angular` (p,) marks angles in rad.  Where d2 is beyond the `gate` of this probability nothing changes (1: no
+        gate).  Raises EventError for numbers that are none, MapError for names that are not in the map.
+
+        >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+        >>> slam = km.Slam(rover)
+        >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=["door", "mast"]))
+        >>> slam.fuse(["door", "mast"], lambda a, b: np.linalg.norm(a - b), 3.28, 0.01**2).outcome  # a tape measure
+        'associated'
+        >>> float(np.linalg.norm(slam.mean("door") - slam.mean("mast")).round(2))
+        3.28
+        """
+        done = correct_by_factor(self.state, names, factor_of(names, expect, y, cov, angular), gate)
+        self.state.settle()
+        return done
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""

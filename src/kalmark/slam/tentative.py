@@ -18,10 +18,10 @@ from kalmark.arrays import Flags
 from kalmark.association.protocol import REMAP, Decision
 from kalmark.errors import MapError
 from kalmark.events import Id
-from kalmark.filter.estimators import Update
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.management import ambiguous_tags, confirm, merge, wall_growth
+from kalmark.management import ambiguous_tags, confirm, wall_growth
 from kalmark.report import JudgedScan, Observation
+from kalmark.slam.factors import update_by_blocks
 from kalmark.slam.policy import Policy
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import State
@@ -75,20 +75,19 @@ def _confirm(state: State, scan: ScanContext, track: Track) -> None:
     del state.tracks.tentative[track.id]
     state.tracks.confirm(track)
     late: list[Late] = [] if track.first is None else [track.first]
+    here = scan.channel
     for m in track.measurements:
         channel, clone = state.channels[m.robot, m.sensor], state.clones[m.clone]
         try:
             start, R = confirm.measurement_difference(state.map, state.estimator, channel, clone, track, m)
-            slot = state.add(start)
+            update = update_by_blocks(scan.robot, -1, here.at, np.zeros((1, len(R))), R[None], here.gate)
+            done = state.corrected_by([start], update)
         except np.linalg.LinAlgError:
             continue
         except MapError:  # it is full
             break
-        p, gate = len(R), scan.channel.gate
-        model = merge.ZeroDifference(scan.channel.at, p)
-        update = Update(model, scan.robot, -1, np.array([slot]), p, np.zeros((1, p)), R[None], gate)
-        done = state.corrected(update, scan.event)
-        state.map.remove(slot)
+        if not done.valid:
+            state.refuse_lost(scan.event)
         if done.fused[0]:
             track.observations += 1
             late.append(m.late)
