@@ -23,7 +23,20 @@ class Picture:
         Within(),
         "Box to draw: [x_min, x_max, y_min, y_max], in space with z_min, z_max; all of the map if absent.",
     ] = None
-    width_px: Annotated[float | None, Within(gt=0), "Width of the picture; by its content if absent."] = None
+    width_px: Annotated[
+        float | None,
+        Within(gt=0),
+        "Width of map.png, of the figure of `km.draw` and of rerun's window; by default their own.",
+    ] = None
+    sensor_width_px: Annotated[
+        float | None, Within(gt=0), "Width of the pictures of sensors, on the page too; by default their own."
+    ] = None
+    format: Annotated[
+        Literal["png", "svg", "pdf"], Within(), "Map and pictures of sensors are also written in this format."
+    ] = "png"
+    robot: Annotated[
+        Literal["dart", "box", "disc"], Within(), "Shape of the drawn robots; in space their cameras are drawn, too."
+    ] = "dart"
     ellipses: Annotated[
         Literal["shape", "world", "off"],
         "Ellipses of the shape of the map, in the world with the start's uncertainty, or none.",
@@ -36,7 +49,8 @@ class Picture:
         Mapping[str, str] | None,
         Values(),
         "Colours, as matplotlib names them, of a robot by its name, and of `landmarks`, `others` (landmarks of space "
-        "that are not Euclidean), `lines` and `truth`.",
+        "that are not Euclidean), `lines` and `truth`; in pictures of sensors of `measured`, and of the expectations "
+        "`landmarks_used`, `others_used`, `landmarks_predicted` and `others_predicted`.",
     ] = None
 
     def __post_init__(self) -> None:

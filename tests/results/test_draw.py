@@ -17,12 +17,13 @@ import kalmark as km
 from kalmark.logs.log import Log, Trajectory
 from kalmark.report import Report
 from kalmark.results.plot import draw_map, save_map
+from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
 from kalmark.results.report import series
 from kalmark.results.run import Run
-from kalmark.results.scene import OUTCOME_COLOURS, Scene
+from kalmark.results.scene import BODIES, BODY_SIZE, OUTCOME_COLOURS, Scene
 from results_space import slam_for as slam_in_space
-from results_space import spiral
+from results_space import spiral, with_camera
 from results_world import circle, slam_for
 
 POSTS = {1: (4.0, 1.0), 2: (2.0, 3.0), 3: (-1.0, 2.0)}
@@ -135,7 +136,7 @@ def test_options_change_what_is_drawn() -> None:
     options: dict[str, Any] = {"ellipses": "off", "sensors": False, "colours": {"landmarks": "#123456"}}
     axes = km.draw(slam, None, {"rover": np.zeros(3), **POSTS}, report, limits_m=[-2, 5, -1, 4], **options)
     labels = [each.get_label() for each in axes.lines if not each.get_label().startswith("_")]
-    assert labels == ["estimated path", "true robot", "true landmarks", "estimated landmarks", "robot"]
+    assert labels == ["estimated path", "true landmarks", "true robot", "estimated landmarks", "robot"]
     assert line(axes, "estimated landmarks").get_color() == "#123456"
     assert (*axes.get_xlim(), *axes.get_ylim()) == (-2, 5, -1, 4)
     world, shape = (km.draw(slam, ellipses=each) for each in ("world", "shape"))
@@ -227,6 +228,7 @@ def test_the_section_changes_the_page(run: Run) -> None:
     usual = series(run, Scene.of(run))["picture"]
     assert usual == {
         "eye": None, "flat": False, "orbit": False, "sigmas": 3.0, "labels": False, "truth": True, "colours": {},
+        "behind": None, "sensorWidth": None,
     }  # fmt: skip
     other = drawn(run, sigmas=1.0, labels=True, truth=False, colours={"landmarks": "red"}, limits_m=[0, 1, 2, 3])
     data = series(other, Scene.of(other))
@@ -244,3 +246,56 @@ def test_a_view_of_space_turns_map_and_page() -> None:
     assert page["flat"] and page["eye"] == [0.0, -1.0, 0.0]
     orbit = drawn(side, view="orbit")
     assert series(orbit, Scene.of(orbit))["picture"]["orbit"]
+
+
+def test_the_true_robot_is_at_its_place_of_the_step_on_map_and_page(run: Run) -> None:
+    (robot,) = series(run, Scene.of(run, world=True))["robots"]
+    true = run.truth.poses_in_map()
+    assert robot["truth"]["x"] == pytest.approx(true[:, 0], abs=1e-4)
+    assert robot["truth"]["theta"] == pytest.approx(true[:, 2], abs=1e-4)
+    for step in (5, None):
+        (axes,) = draw_map(run, step, world=True).axes
+        mark = line(axes, "true end")
+        assert np.allclose(mark.get_xydata(), true[None, -1 if step is None else step, :2])
+        ahead = mark._marker.get_user_transform().transform([1.0, 0.0])
+        assert np.arctan2(ahead[1], ahead[0]) == pytest.approx(true[-1 if step is None else step, 2])
+    assert "true end" not in {each.get_label() for each in draw_map(drawn(run, truth=False), world=True).axes[0].lines}
+
+
+@pytest.mark.parametrize("shape", ["dart", "box", "disc"])
+def test_the_shape_of_a_robot_is_that_of_the_picture_everywhere(run: Run, shape: str) -> None:
+    other = drawn(run, robot=shape)
+    (axes,) = draw_map(other).axes
+    assert np.array_equal(line(axes, "end")._marker.get_path().vertices, BODIES[shape])
+    scene = Scene.of(other)
+    body = series(other, scene)["bodies"]["rover"]
+    outline = np.column_stack([body["x"], body["y"]])[:-1].astype(float)
+    assert np.allclose(outline, BODY_SIZE * scene.size * BODIES[shape], atol=1e-4)
+    assert outline[outline[:, 0].argmax(), 1] == 0.0, "its nose is ahead"
+
+
+def test_cameras_of_a_robot_in_space_are_drawn_unless_sensors_are_not() -> None:
+    slam, log = with_camera(spiral(steps=3))
+    run = record(slam, log, progress=False)
+    count = {sensors: len(Scene.of(drawn(run, sensors=sensors)).body("rover")) for sensors in (True, False)}
+    assert count == {True: 3, False: 2}
+    behind = series(drawn(run, view="self"), Scene.of(drawn(run, view="self")))["picture"]["behind"]
+    assert behind[:2] == [20.0, 180.0]
+
+
+def test_pictures_of_sensors_have_width_colours_and_format_of_the_section(tmp_path: Path) -> None:
+    slam, log = with_camera(spiral(steps=4))
+    options = {"sensor_width_px": 500, "format": "svg", "colours": {"measured": "tab:red", "landmarks_used": "k"}}
+    other = drawn(record(slam, log, progress=False), **options)
+    names = {path.name for path in other.report(tmp_path)}
+    assert {"map.png", "map.svg", "sensor_rover_eye.png", "sensor_rover_eye.svg"} <= names
+    assert imread(tmp_path / "sensor_rover_eye.png").shape[1] == 500
+    assert "<svg" in (tmp_path / "map.svg").read_text()
+    colours = {to_hex(each.get_color()) for each in draw_sensor(other, "rover", "eye").legends[0].get_lines()}
+    assert {to_hex("tab:red"), "#000000"} <= colours
+    page = series(other, Scene.of(other))
+    assert (page["picture"]["sensorWidth"], page["picture"]["colours"]["measured"]) == (500, to_hex("tab:red"))
+    expected = {s["colour"] for s in page["cameras"][0]["scans"][-1]["images"][0]["seen"] if "colour" in s}
+    assert "#000000" in expected
+    with pytest.raises(km.KalmarkError, match=r"map.bmp: the ending is '.bmp', expected a format of matplotlib"):
+        save_map(other, tmp_path / "map.bmp")

@@ -78,6 +78,7 @@ def test_the_map_of_a_run_in_space_has_a_view_and_a_plan(run: Run, tmp_path: Pat
         "estimated path",
         "true path, aligned",
         "true landmarks, aligned",
+        "true end, aligned",
         "Euclidean landmarks, 3σ of the shape",
         *ends,
         "dead reckoning",
@@ -192,7 +193,7 @@ def test_the_page_has_the_map_and_the_images_of_every_position_of_the_slider(run
     assert len(robot["q"][0]) == len(robot["z"]) == len(robot["t"])
     assert len(robot["error"]) == data["dof"] == 6
     assert set(data["maps"][-1]) >= {"x", "y", "z", "pxx", "pyz", "pzz", "group", "lines", "tags"}
-    assert len(data["bodies"]["rover"]["x"]) == 11
+    assert len(data["bodies"]["rover"]["x"]) == 20, "outline, mast and pyramid, nothing behind each"
 
 
 TURNED = """<script>

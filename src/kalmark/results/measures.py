@@ -50,8 +50,8 @@ class Rigid(NamedTuple):
         """Return poses (N, 3) = (x, y, theta) or (N, 7) = (x, y, z, qx, qy, qz, qw) rotated and shifted."""
         if poses.shape[1] == 7:
             turn = from_matrix(np.ascontiguousarray(self.rotation))
-            turned = np.array([multiply(turn, q) for q in np.ascontiguousarray(poses[:, 3:])])
-            return np.column_stack([self(poses[:, :3]), turned.reshape(-1, 4)])
+            product = np.array([multiply(turn, q) for q in np.eye(4)])  # of quaternions: linear in the second
+            return np.column_stack([self(poses[:, :3]), poses[:, 3:] @ product])
         angle = np.arctan2(self.rotation[1, 0], self.rotation[0, 0])
         return np.column_stack([self(poses[:, :2]), poses[:, 2] + angle])
 

@@ -20,12 +20,14 @@ from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
 from kalmark.arrays import Array
+from kalmark.errors import KalmarkError
 from kalmark.files import replace_file
 from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.landmark_table import LINES, TAG
 from kalmark.results.recording import Recording
 from kalmark.results.scene import (
+    BODIES,
     FIX_COLOUR,
     INK,
     OUTCOME_COLOURS,
@@ -78,22 +80,30 @@ class Stroke(NamedTuple):
 
 
 def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim: bool = True) -> None:
-    """Write a figure as a PNG, completely or not, with a narrow rim around the drawing, or as it is.
+    """Write a figure completely or not, with a narrow rim around the drawing, or as it is.
 
-    matplotlib draws twice to find that box, which only a figure with a layout of its own needs.
+    The ending of the name is that of a PNG, SVG or PDF, or of another format of matplotlib.  It draws twice to find
+    that box, which only a figure with a layout of its own needs.  Raises KalmarkError for another ending.
     """
+    path = FilePath(path)
+    ending = path.suffix.lower().lstrip(".")
+    if ending not in (known := FigureCanvasAgg.get_supported_filetypes()):
+        raise KalmarkError(
+            f"{path}: the ending is {path.suffix!r}, expected a format of matplotlib: {', '.join(known)}"
+        )
     figure.set_dpi(dpi)
     FigureCanvasAgg(figure)
     laid_out = figure.get_layout_engine() is not None
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # of a name in a script that the font does not have
         box = None if not rim else "tight" if laid_out else figure.get_tightbbox().padded(0.15)
-        style: dict[str, Any] = {"bbox_inches": box, "pad_inches": 0.15, "pil_kwargs": {"compress_level": 3}}
-        replace_file(FilePath(path), partial(figure.savefig, dpi=dpi, format="png", **style))
+        style: dict[str, Any] = {"bbox_inches": box, "pad_inches": 0.15}
+        style |= {"pil_kwargs": {"compress_level": 3}} if ending == "png" else {}
+        replace_file(path, partial(figure.savefig, dpi=dpi, format=ending, **style))
 
 
 def save_map(run: Recording, path: str | PathLike[str], world: bool = False) -> None:
-    """Draw the map of a run and write it as a PNG, with the ellipses of its shape or those in the world."""
+    """Draw the map of a run and write it, with the ellipses of its shape or those in the world."""
     figure, width_px = draw_map(run, world=world), picture_of(run).width_px
     save_figure(figure, path, 130.0 if width_px is None else width_px / figure.get_figwidth(), rim=width_px is None)
 
@@ -216,13 +226,13 @@ def _true_style(scene: Scene) -> dict[str, Any]:
 
 def _true_paths(scene: Scene) -> list[Stroke]:
     style, label = _true_style(scene), f"true path{'s' if len(scene.paths) > 1 else ''}{scene.how}"
-    lines = [break_path(path, scene.stretches[robot]) for robot, path in scene.truth.items()]
-    return [Stroke(line, style, label, style) for line in lines]
+    ways = {robot: way[:, : scene.d] for robot, way in scene.truth.items() if len(way) > 1}
+    return [Stroke(break_path(way, scene.stretches[robot]), style, label, style) for robot, way in ways.items()]
 
 
 def _true_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
     points, lines, style = list(scene.true_points().values()), scene.true_lines(), _true_style(scene)
-    out = [_robot_mark(scene, pose, style["color"], "true robot", 5.5) for pose in scene.true_ends.values()]
+    said, out = f"true {scene.end}{scene.how}", []
     if points:
         colour, zorder = (scene.picture.colour("truth", INK), 6) if scene.d == 2 else (style["color"], 2)
         plus = _marks("+", colour, 4 if crowded else 8, zorder) | {"markeredgewidth": 0.6 if crowded else 1.0}
@@ -233,6 +243,7 @@ def _true_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
                 join_polylines(lines, scene.d), style, f"true {'walls' if scene.d == 2 else 'lines'}{scene.how}", style
             )
         )
+    out += [_robot_mark(scene, pose, style["color"], said, 5.5) for pose in scene.true_ends.values()]
     tags = np.array([l for l in scene.true_landmarks.values() if len(l) == TAG]).reshape(-1, TAG)
     return [*out, Stroke(join_polylines(squares(tags, scene.size)), style)] if len(tags) else out
 
@@ -284,16 +295,16 @@ def _robot_strokes(scene: Scene) -> list[Stroke]:
         style = {"color": colour if d == 2 else POSE_COLOUR, "linewidth": 0.9, "zorder": 7}
         said = f"{scene.end}{scene.how_large()}" if scene.how_large() else ""
         rings.append(Stroke(ring, style, said, style | {"color": INK if d == 2 else POSE_COLOUR}))
-        if d == 3 and scene.picture.sensors:
+        if d == 3:
             thin = {"color": colour, "linewidth": 0.8, "alpha": 0.8, "zorder": 6}
             rings.append(Stroke(join_polylines(scene.frames(robot)), thin))
     return starts + ends + rings
 
 
 def _robot_mark(scene: Scene, pose: Array, colour: str, label: str, zorder: float) -> Stroke:
-    """Return a robot at a pose (3|7,): a dart along its heading, in space a disc."""
-    marker, size = (_arrow(float(pose[2])), 15) if scene.d == 2 else ("o", 6)
-    sample = _marks(_arrow(0.0) if scene.d == 2 else "o", INK, 11 if scene.d == 2 else 6, 1)
+    """Return a robot at a pose (3|7,): its outline, in space a disc."""
+    marker, size = (_outline(scene, float(pose[2])), 15) if scene.d == 2 else ("o", 6)
+    sample = _marks(_outline(scene, 0.0) if scene.d == 2 else "o", INK, 11 if scene.d == 2 else 6, 1)
     sample |= {"color": colour} if label.startswith("true") else {}
     style = _marks(marker, colour, size, zorder) | {"markeredgecolor": "white"}
     return Stroke(pose[None, : scene.d], style, label, sample)
@@ -322,10 +333,9 @@ def _marks(marker: Any, colour: str, size: float, zorder: float) -> dict[str, An
     return {"linestyle": "", "marker": marker, "color": colour, "markersize": size, "zorder": zorder}
 
 
-def _arrow(heading: float) -> MarkerStyle:
-    """Return a dart that points along a heading, about the robot's place."""
-    dart = Path([(0.62, 0.0), (-0.38, 0.36), (-0.16, 0.0), (-0.38, -0.36), (0.62, 0.0)], closed=True)
-    return MarkerStyle(dart, transform=Affine2D().rotate(heading))
+def _outline(scene: Scene, heading: float) -> MarkerStyle:
+    """Return the outline of a robot that looks along a heading, about its place."""
+    return MarkerStyle(Path(BODIES[scene.picture.robot], closed=True), transform=Affine2D().rotate(heading))
 
 
 def legend(scene: Scene) -> list[Line2D]:

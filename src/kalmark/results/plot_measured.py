@@ -17,12 +17,13 @@ from matplotlib.lines import Line2D
 
 from kalmark.arrays import Array, Flags
 from kalmark.geometry.gaussian import ellipses
+from kalmark.picture_options import Picture
 from kalmark.results.history import History, Measuring
 from kalmark.results.scene import IN_VIEW, INK
 
 ACROSS = ("bearing_rad", "azimuth_rad", "y_m")  # columns to be drawn from right to left, the first that there is,
 AHEAD = ("range_m", "x_m")  # and upwards
-USED, UNUSED, UNMEASURED, MARK = "#0aa5b5", "#c8553d", "#1f3fd0", "#2b2f36"
+USED, UNUSED, UNMEASURED = "#0aa5b5", "#c8553d", "#1f3fd0"
 DEGREES = 180.0 / np.pi
 
 
@@ -53,10 +54,12 @@ def _axis(name: str, column: int) -> Axis:
     return Axis(column, DEGREES, f"{quantity} (deg)") if unit == "rad" else Axis(column, 1.0, f"{quantity} ({unit})")
 
 
-def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
+def draw_measured(history: History, sensor: Measuring, step: int, options: Picture) -> Figure:
     """Return the figure of a scan by a sensor that has `axes_of`."""
     found = axes_of(sensor)
     assert found is not None
+    mark, used_colour = options.colour("measured", INK), options.colour("landmarks_used", USED)
+    unused, unmeasured = (options.colour("landmarks_predicted", usual) for usual in (UNUSED, UNMEASURED))
     rows = np.flatnonzero(history.step == step)
     in_map = bool(history.of_own[rows].any())  # of the robot's own position: x to the right, y upwards, as in the map
     found = found[::-1] if in_map else found
@@ -71,12 +74,12 @@ def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
         y[:, k] = wrap_deg(y[:, k])
         e[:, k] = np.where(np.isfinite(y[:, k]), y[:, k] + wrap_deg(e[:, k] - y[:, k]), e[:, k])
     used = np.isin(history.outcome[rows], ("associated", "new"))
-    axes.plot(*y.T, "+", color=MARK, ms=9, mew=1.4, zorder=4)
-    _draw(axes, e[used], Z[used], USED, "-")
-    _draw(axes, e[~used], Z[~used], UNUSED, "--")
+    axes.plot(*y.T, "+", color=mark, ms=9, mew=1.4, zorder=4)
+    _draw(axes, e[used], Z[used], used_colour, "-")
+    _draw(axes, e[~used], Z[~used], unused, "--")
     missed = np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == sensor.sensor))
     e_m, Z_m = _expected(history.unmeasured_e[missed], history.unmeasured_Z[missed], columns, scale)
-    _draw(axes, e_m, Z_m, UNMEASURED, ":")
+    _draw(axes, e_m, Z_m, unmeasured, ":")
     names = [*history.landmark[rows].tolist(), *history.unmeasured_landmark[missed].tolist()]
     for at, name in zip([*y, *e_m], names, strict=True):
         axes.annotate(name, at, (5, 5), textcoords="offset points", fontsize=8, color=INK)
@@ -90,7 +93,8 @@ def draw_measured(history: History, sensor: Measuring, step: int) -> Figure:
     said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
     title = f"{sensor.robot} · {sensor.sensor} · t = {history.t_s[step]:.3f} s · {said}"
     figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
-    figure.legend(handles=_legend(used, e, len(missed)), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    handles = _legend(used, e, len(missed), (mark, used_colour, unused, unmeasured))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 
@@ -110,14 +114,15 @@ def _draw(axes: Axes, e: Array, Z: Array, colour: str, style: str) -> None:
         axes.plot(*contour.T, style, color=colour, lw=1.2, zorder=5)
 
 
-def _legend(used: Flags, e: Array, missed: int) -> list[Line2D]:
+def _legend(used: Flags, e: Array, missed: int, colours: tuple[str, str, str, str]) -> list[Line2D]:
+    mark, used_colour, unused, unmeasured = colours
     expected, line = np.isfinite(e).all(axis=1), "expected, $3\\sigma$"
     cross: dict[str, Any] = {"ls": "", "marker": "+", "mew": 1.4}
-    out = [Line2D([], [], color=MARK, **cross, label="measured")]
+    out = [Line2D([], [], color=mark, **cross, label="measured")]
     if (expected & used).any():
-        out.append(Line2D([], [], color=USED, label=f"{line}, used"))
+        out.append(Line2D([], [], color=used_colour, label=f"{line}, used"))
     if (expected & ~used).any():
-        out.append(Line2D([], [], color=UNUSED, ls="--", label=f"{line}, not used"))
+        out.append(Line2D([], [], color=unused, ls="--", label=f"{line}, not used"))
     if missed:
-        out.append(Line2D([], [], color=UNMEASURED, ls=":", label=f"{line}, {IN_VIEW}"))
+        out.append(Line2D([], [], color=unmeasured, ls=":", label=f"{line}, {IN_VIEW}"))
     return out

@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 
 from kalmark.arrays import Array
 from kalmark.errors import RunError
+from kalmark.picture_options import Picture
 from kalmark.results.camera_images import Pictures
 from kalmark.results.explain import Explanation, Fate
 from kalmark.results.figure_texts import figure as figure_of
@@ -32,6 +33,7 @@ from kalmark.results.scene import (
     contours,
     images,
     join_polylines,
+    picture_of,
     steps_of,
 )
 
@@ -43,7 +45,7 @@ MOST_NAMES = 30  # of landmarks, over a picture
 PAPER = 490.0  # width of the axes in points, about
 MARK = 6.0  # half a cross or a square, in points
 ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
-MEASURED, NAME = "#7d838d", "#1e4d2b"
+MEASURED, SEGMENT, NAME = "#7d838d", "#3a68c8", "#1e4d2b"
 
 
 def draw_scan(run: Recording, told: Explanation) -> Figure:
@@ -201,24 +203,24 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     if len(steps) == 0:
         raise RunError(f"sensor {robot}.{sensor} saw nothing until then, expected a scan with an observation")
     if isinstance(camera, Measuring):
-        return draw_measured(history, camera, int(steps[-1]))
+        return draw_measured(history, camera, int(steps[-1]), picture_of(run))
     seen = images(history, camera, int(steps[-1]))
     shape = camera.size[1] / camera.size[0]
     width = 9.0 if len(seen) == 1 else 14.0
     figure = Figure(figsize=(width, (width - 1.0) / len(seen) * shape + 1.5), layout="constrained", facecolor="white")
     grid = figure.subplots(1, len(seen), squeeze=False)[0]
-    pictures = Pictures(run)
+    pictures, options = Pictures(run), picture_of(run)
     for axes, image in zip(grid, seen, strict=True):
-        draw_image(axes, image, camera.size, pictures.at(camera, int(steps[-1]), image.side))
+        draw_image(axes, image, camera.size, options, pictures.at(camera, int(steps[-1]), image.side))
     outcomes = Counter(s.outcome for s in seen[0].sightings)
     said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
     title = f"{robot} · {sensor} · t = {history.t_s[steps[-1]]:.3f} s · {said}"
     figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
-    figure.legend(handles=legend(seen), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    figure.legend(handles=legend(seen, options), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 
 
-def draw_image(axes: Axes, image: Image, size: tuple[float, float], picture: Any = None) -> None:
+def draw_image(axes: Axes, image: Image, size: tuple[float, float], options: Picture, picture: Any = None) -> None:
     """Draw what one image of a camera shows of a scan, over its `picture` (H, W) if there is one: u right, v down."""
     if picture is not None:
         height, width = picture.shape
@@ -235,20 +237,23 @@ def draw_image(axes: Axes, image: Image, size: tuple[float, float], picture: Any
     named = picture is None or len(image.sightings) <= MOST_NAMES
     measured = MEASURED if picture is None else ON_IMAGE
     for sighting in image.sightings:
-        _draw(axes, sighting, size, named, measured)
+        _draw(axes, sighting, size, named, options, measured)
 
 
-def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, measured: str) -> None:
-    colour, _ = colour_of(s)
+def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, options: Picture, point: str) -> None:
+    colour, _ = colour_of(s, options)
     expected, single = np.isfinite(s.expected).all(), len(s.expected) == 1
     closed = np.vstack([s.measured, s.measured[:1]]) if len(s.measured) > 2 else s.measured
     rejected, new = s.outcome == "rejected", s.outcome == "new"
     if not len(s.measured):
         pass
     elif single:
-        axes.plot(*s.measured.T, "+", color=measured, markersize=8, markeredgewidth=1.1, zorder=3)
+        axes.plot(
+            *s.measured.T, "+", color=options.colour("measured", point), markersize=8, markeredgewidth=1.1, zorder=3
+        )
     else:
-        axes.plot(*closed.T, "-", color="#3a68c8" if not new else MEASURED, linewidth=3.0, alpha=0.55, zorder=2)
+        thick = options.colour("measured", MEASURED if new else SEGMENT)
+        axes.plot(*closed.T, "-", color=thick, linewidth=3.0, alpha=0.55, zorder=2)
     if new:
         axes.plot(*s.measured.T, "s", markerfacecolor="none", color=NAME, markersize=9, markeredgewidth=0.9, zorder=3)
     if rejected:
@@ -278,14 +283,14 @@ def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: s
         axes.plot(*np.vstack([s.expected, s.expected[:1]]).T, **style)
 
 
-def legend(seen: list[Image]) -> list[Line2D]:
+def legend(seen: list[Image], options: Picture) -> list[Line2D]:
     """Return the entries of the legend: only what there is."""
     sightings = [s for image in seen for s in image.sightings]
-    out = [Line2D([], [], color=MEASURED, marker="+", linestyle="", label="measured")]
-    if any(len(s.measured) > 1 for s in sightings):
-        out = [Line2D([], [], color="#3a68c8", linewidth=3, alpha=0.55, label="measured")]
-    found = dict.fromkeys(colour_of(s) for s in sightings if np.isfinite(s.expected).all())
     lines = any(len(s.measured) > 1 for s in sightings)
+    mark: dict[str, Any] = {"linewidth": 3, "alpha": 0.55} if lines else {"marker": "+", "linestyle": ""}
+    colour = options.colour("measured", SEGMENT if lines else MEASURED)
+    out = [Line2D([], [], color=colour, label="measured", **mark)]
+    found = dict.fromkeys(colour_of(s, options) for s in sightings if np.isfinite(s.expected).all())
     out += [Line2D([], [], color=c, label=label if lines else f"{label}, 3σ") for c, label in sorted(found)]
     if any(s.outcome == "new" for s in sightings):
         square: dict[str, Any] = {"marker": "s", "markerfacecolor": "none", "linestyle": ""}

@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 
 from kalmark.arrays import Array
+from kalmark.picture_options import Picture
 from kalmark.report import OUTCOMES
 from kalmark.results.camera_images import Pictures
 from kalmark.results.evaluate import headline, summary_of
@@ -36,7 +37,7 @@ from kalmark.results.figure_texts import (
 )
 from kalmark.results.history import Camera, History, Ints, LandmarkChange, MapSnapshot
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
-from kalmark.results.plot import Projection
+from kalmark.results.plot import BEHIND, Projection
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
     POINTS,
@@ -48,6 +49,7 @@ from kalmark.results.scene import (
     images,
     join_polylines,
     map_shapes,
+    picture_of,
     spread_indices,
     squares,
     steps_of,
@@ -212,7 +214,7 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
         "fixes": {robot: xy(points[spread_indices(len(points))]) for robot, points in scene.fixes.items()},
         "repeats": xy(scene.repeats),
         "usedFixes": {robot: xy(points[spread_indices(len(points))]) for robot, points in scene.used.items()},
-        "bodies": {robot: xy(join_polylines(scene.body(robot))) for robot in scene.paths if scene.d == 3},
+        "bodies": {robot: xy(join_polylines(scene.body(robot))[:, : scene.d]) for robot in scene.paths},
         "cameras": [_camera(run, camera, maps, t, pictures) for camera in run.history.cameras],
         "robots": [_robot(run, scene, robot, t) for robot in scene.paths],
         "innovations": _innovations(run, scene),
@@ -233,6 +235,8 @@ def page_options(scene: Scene) -> dict[str, Any]:
         "eye": None if view in ("normal", "orbit") else round_values(eye, 4),
         "flat": view in ("top", "side", "front"),
         "orbit": view == "orbit",
+        "behind": [*BEHIND[:2], BEHIND[2] * scene.size] if picture.view == "self" else None,
+        "sensorWidth": picture.sensor_width_px,
         "sigmas": 0.0 if picture.ellipses == "off" else picture.sigmas,
         "labels": bool(picture.labels),
         "truth": picture.truth,
@@ -253,7 +257,7 @@ def _camera(
     run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array, pictures: Pictures
 ) -> dict[str, Any]:  # fmt: skip
     """Return the last images of a camera at the maps: `frames` are indices of its `scans`, None before the first."""
-    steps = steps_of(run.history, camera)
+    steps, options = steps_of(run.history, camera), picture_of(run)
     last = np.searchsorted(steps, [m.step for m in maps], side="right") - 1
     used = np.unique(last[last >= 0])
     scans = []
@@ -261,7 +265,7 @@ def _camera(
         seen = []
         for image in images(run.history, camera, step):
             picture = pictures.uri(camera, step, image.side)
-            seen.append({"side": image.side, "seen": [_seen(sighting) for sighting in image.sightings]}
+            seen.append({"side": image.side, "seen": [_seen(sighting, options) for sighting in image.sightings]}
                         | ({"picture": picture} if picture else {}))  # fmt: skip
         scans.append({"t": round(float(t[step]), 3), "images": seen})
     frames = [int(np.searchsorted(used, k)) if k >= 0 else None for k in last]
@@ -269,8 +273,9 @@ def _camera(
     return {"name": f"{camera.robot} · {camera.sensor}", "size": size, "scans": scans, "frames": frames}
 
 
-def _seen(s: Sighting) -> dict[str, Any]:
-    colour, meaning = colour_of(s)
+def _seen(s: Sighting, options: Picture) -> dict[str, Any]:
+    colour, meaning = colour_of(s, options)
+    colour = to_hex(colour)
     out: dict[str, Any] = {"name": s.name, "outcome": s.outcome, "y": [round_values(p, 2) for p in s.measured]}
     if np.isfinite(s.expected).all():
         out |= {"e": [round_values(p, 2) for p in s.expected], "colour": colour, "meaning": meaning}
@@ -289,21 +294,24 @@ def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]
     stretches = scene.stretches[robot][spread_indices(len(scene.stretches[robot]))]
     out["gaps"] = _gaps(stretches)
     out["dotted"] = _gaps(np.cumsum(scene.dotted[robot], dtype=np.int64)[spread_indices(len(scene.dotted[robot]))])
-    out |= (
-        {"theta": round_significant(mean[:, 2], 5)}
-        if d == 2
-        else {"q": [round_significant(q, 5) for q in mean[:, 3:].T]}
-    )
+    out |= _orientations(mean)
     dead = scene.dead[robot]
     if np.isfinite(dead).any():
         out["dead"] = xy(break_path(dead[spread_indices(len(dead))], stretches))
     if robot in scene.truth:
-        true = scene.truth[robot]
-        out["truth"] = xy(break_path(true[spread_indices(len(true))], stretches))
+        true = scene.truth[robot][spread_indices(len(scene.truth[robot]))]
+        out["truth"] = xy(true[:, :d]) | _orientations(true)
         out |= _errors(run, rows)
     else:
         out["sigma"] = [round_significant(column) for column in _sigmas(run, rows).T]
     return out
+
+
+def _orientations(poses: Array) -> dict[str, Any]:
+    """Return the headings of poses (N, 3), or the quaternions of poses (N, 7)."""
+    if poses.shape[1] == 3:
+        return {"theta": round_significant(poses[:, 2], 5)}
+    return {"q": [round_significant(q, 5) for q in poses[:, 3:].T]}
 
 
 def _sigmas(run: Recording, rows: Ints) -> Array:

@@ -11,13 +11,14 @@ from kalmark.files import replace_folder, write
 from kalmark.results.evaluate import evaluate
 from kalmark.results.history import Camera, Measuring
 from kalmark.results.recording import Recording, file_name
-from kalmark.results.scene import steps_of
+from kalmark.results.scene import picture_of, steps_of
 
 __all__ = ["Run"]
 
 FILES = (
     *("summary.json", "config.yaml", "landmarks.csv", "associations.csv", "changes.csv", "history.npz", "map.kmk"),
-    *("map.png", "report.html", "trajectory_*.tum", "sensor_*.png"),
+    *("report.html", "trajectory_*.tum"),
+    *(f"{name}.{ending}" for name in ("map", "sensor_*") for ending in ("png", "svg", "pdf")),
 )
 """Patterns of the files of a run folder."""
 
@@ -68,19 +69,28 @@ class Run(Recording):
     def report(self, folder: str | Path, world: bool = False) -> list[Path]:
         """Write ``map.png``, ``report.html`` and each sensor's last scan into a folder; return their paths.
 
-        Maps have the ellipses of the shape or those in the `world`.
+        Maps have the ellipses of the shape or those in the `world`.  The section `picture` of the configuration may
+        name another format, in which the pictures are written, too.
         """
         from kalmark.results.plot import save_figure, save_map  # matplotlib is slow to import
         from kalmark.results.plot_measured import sensors_with_picture
         from kalmark.results.plot_scan import draw_sensor
         from kalmark.results.report import report_html
 
-        folder = Path(folder)
-        save_map(self, folder / "map.png", world)
-        written = [folder / "map.png", folder / "report.html"]
+        folder, picture = Path(folder), picture_of(self)
+        endings = dict.fromkeys(("png", picture.format))
+        written = [*(folder / f"map.{ending}" for ending in endings), folder / "report.html"]
+        for path in written[:-1]:
+            save_map(self, path, world)
         drawable: list[Camera | Measuring] = [*self.history.cameras, *sensors_with_picture(self.history)]
         for seen in (sensor for sensor in drawable if len(steps_of(self.history, sensor))):
-            written.append(folder / f"sensor_{file_name(seen.robot)}_{file_name(seen.sensor)}.png")
-            save_figure(draw_sensor(self, seen.robot, seen.sensor), written[-1], dpi=110, rim=False)
+            figure, name = (
+                draw_sensor(self, seen.robot, seen.sensor),
+                f"{file_name(seen.robot)}_{file_name(seen.sensor)}",
+            )
+            dpi = 110 if picture.sensor_width_px is None else picture.sensor_width_px / figure.get_figwidth()
+            for ending in endings:
+                written.append(folder / f"sensor_{name}.{ending}")
+                save_figure(figure, written[-1], dpi, rim=False)
         write(folder / "report.html", report_html(self, world))
         return written

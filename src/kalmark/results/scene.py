@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
 
@@ -32,11 +32,11 @@ from kalmark.results.recording import Recording
 from kalmark.results.truth import as_rigid, move_landmarks
 
 COLUMN = re.compile(r"([uv])([lr]?)(\d*)_px")
-EXPECTED = {  # colours and their meaning, by whether the landmark is Euclidean, then whether it was used
-    (True, True): ("#0aa5b5", "Euclidean, used"),
-    (True, False): ("#1f3fd0", "Euclidean, predicted only"),
-    (False, True): ("#d81b1b", "not Euclidean, used"),
-    (False, False): ("#c218c2", "not Euclidean, predicted only"),
+EXPECTED = {  # names of colours, usual ones, meanings: by whether a landmark is Euclidean, then whether it was used
+    (True, True): ("landmarks_used", "#0aa5b5", "Euclidean, used"),
+    (True, False): ("landmarks_predicted", "#1f3fd0", "Euclidean, predicted only"),
+    (False, True): ("others_used", "#d81b1b", "not Euclidean, used"),
+    (False, False): ("others_predicted", "#c218c2", "not Euclidean, predicted only"),
 }
 IN_VIEW = "in view, not measured"
 SIDES = {"": "", "l": "left", "r": "right"}
@@ -54,7 +54,15 @@ OUTCOME_COLOURS = {
 }  # fmt: skip
 NARROW = 0.15  # the least width of a plan, as a part of its length
 FRAMES = 6  # cameras are drawn at so many poses of a path
-BODY = np.array([[1.0, 0, 0], [-0.6, 0.5, 0], [-0.6, -0.5, 0], [1.0, 0, 0], [-0.6, 0, 0.45], [-0.3, 0, 0]])  # a dart
+NOSE = np.array([[0.36, 0.16], [0.62, 0.0], [0.36, -0.16]])  # of a robot, which shows its heading
+TURN = np.linspace(0.42, 2.0 * np.pi - 0.42, 24)
+BODIES = {  # outlines (P, 2) of robots, which look along x
+    "dart": np.array([[0.62, 0.0], [-0.38, 0.36], [-0.16, 0.0], [-0.38, -0.36], [0.62, 0.0]]),
+    "box": np.vstack([NOSE, [[0.36, -0.32], [-0.4, -0.32], [-0.4, 0.32], [0.36, 0.32]], NOSE[:1]]),
+    "disc": np.vstack([NOSE, 0.394 * np.column_stack([np.cos(TURN), -np.sin(TURN)]), NOSE[:1]]),
+}
+MAST = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.4]])  # of a robot in space, upwards
+BODY_SIZE = 0.035  # as a part of a scene's
 SQUARE = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0], [-0.5, -0.5, 0]])
 
 
@@ -76,16 +84,16 @@ class Scene:
 
     By robot: poses (N, 3|7) and the covariances (N, d, d) of their positions up to the step, `stretches` (S,), the gaps
     in time up to each of all its steps, `dotted` (S,), whether the way to each is unknown, positions by `dead`
-    reckoning (N, d), true ones (N, d; NaN: unknown), fixes (F, 2) to score with and those `used` by the filter (F, d),
-    up to the step, too.
+    reckoning (N, d), true poses (N, 3|7; NaN: unknown), fixes (F, 2) to score with and those `used` by the filter
+    (F, d), up to the step, too.
     `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
     `known` (N, d) are the landmarks known exactly and `known_ids` their names.
     `unseen` (N, d) are those that were not seen again where they should be.
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
     corners of the box to draw, the same for all steps.  Covariances are those of the shape (`kalmark.results.gauge`) or
     those in the `world`.  The truth is `aligned` by a rigid motion of the path where the frames differ, and
-    for the shape.  `true_ends` are the true poses (3|7,) of robots at the step, `rays` the observations of the last
-    scan, `picture` the options, and `end` is the text of the robots' last pose in a legend.
+    for the shape.  `rays` are the observations of the last scan, `picture` the options, and `end` is the text of the
+    robots' last pose in a legend.
     """
 
     d: int
@@ -109,7 +117,6 @@ class Scene:
     known_ids: tuple[Id, ...]
     world: bool
     aligned: bool
-    true_ends: Mapping[str, Array] = field(default_factory=dict)
     rays: tuple[Ray, ...] = ()
     picture: Picture = USUAL
     end: str = "end"
@@ -128,7 +135,7 @@ class Scene:
         mine = {robot: history.robot == robot for robot in history.robots}
         truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
         scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
-        truth = {robot: to_map(poses[:, :d]) for robot, poses in truth.items()}
+        truth = {robot: to_map.poses(poses) for robot, poses in truth.items()}
         landmarks = {
             i: l if d == 3 or len(l) == 2 * d else l[:2] for i, l in move_landmarks(to_map, run.truth.landmarks).items()
         }
@@ -145,7 +152,7 @@ class Scene:
         P = P if world else history.robot_shape(np.arange(len(P)))
         ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
         known_at = exact.positions()[0][:, :d]
-        more = [*truth.values(), *used.values(), *places_of(landmarks, d), known_at]
+        more = [*(way[:, :d] for way in truth.values()), *used.values(), *places_of(landmarks, d), known_at]
         low, high = drawn_box(poses[:, :d], ends, whole, more, picture)
         paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
         dead = {r: history.dead_reckoned[until][rows[until]][:, :d] for r, rows in mine.items()}
@@ -226,20 +233,26 @@ class Scene:
         return np.where(out.any(axis=-1, keepdims=True), np.nan, lines)
 
     def frames(self, robot: str) -> list[Array]:
-        """Return the shapes of a robot along its path: the pyramids of its cameras, or a dart if it has none."""
+        """Return the shapes of a robot in space along its path."""
         path, body = self.paths[robot], self.body(robot)
         at = np.unique(np.linspace(0, max(len(path) - 1, 0), FRAMES).round().astype(int))
         return [_placed(pose, line) for pose in path[at[: len(path)]] for line in body]
 
     def body(self, robot: str) -> list[Array]:
-        """Return a robot in space as polylines (P, 3) in its own frame: pyramids, or a dart."""
-        size, lines = 0.03 * self.size, []
-        for camera in self.cameras:
+        """Return a robot as polylines (P, 3) in its own frame: its outline, in space with a mast, and its cameras."""
+        size, outline = BODY_SIZE * self.size, np.pad(BODIES[self.picture.robot], ((0, 0), (0, 1)))
+        lines = [size * outline, size * MAST][: self.d - 1]
+        for camera in self.cameras if self.picture.sensors else ():
             if camera.robot == robot:
-                a, b, c, d = size * camera.corners
+                a, b, c, d = 0.03 * self.size * camera.corners
                 top = np.zeros(3)  # one polyline passes all edges
                 lines.append(_placed(camera.mount, np.array([a, b, top, a, d, top, c, d, c, b])))
-        return lines or [0.6 * size * BODY]
+        return lines
+
+    @property
+    def true_ends(self) -> dict[str, Array]:
+        """The true poses (3|7,) of robots at the step, where they are known."""
+        return {robot: way[-1] for robot, way in self.truth.items() if np.isfinite(way[-1:]).all(axis=1).any()}
 
     def true_lines(self) -> list[Array]:
         """Return the true lines (2, d)."""
@@ -451,9 +464,10 @@ def _add_sighting(
         image.sightings.append(Sighting(*named, y[at], e[at], Z_at))
 
 
-def colour_of(sighting: Sighting) -> tuple[str, str]:
+def colour_of(sighting: Sighting, picture: Picture) -> tuple[str, str]:
     """Return the colour of an expectation and what it means."""
-    return EXPECTED[sighting.euclidean, sighting.outcome == "associated"]
+    name, usual, meaning = EXPECTED[sighting.euclidean, sighting.outcome == "associated"]
+    return picture.colour(name, usual), meaning
 
 
 def steps_of(history: History, camera: Camera | Measuring) -> Ints:

@@ -110,7 +110,7 @@ def _draw(figure: Figure, run: Recording, scene: Scene, step: int, turned: float
     height = 0.9 / max(len(seen), 1)
     for k, (title, image, size, picture) in enumerate(seen):
         axes = figure.add_axes((left + 0.04, 0.94 - (k + 1) * height + 0.06, 0.95 - left, height - 0.1))
-        draw_image(axes, image, size, picture)
+        draw_image(axes, image, size, scene.picture, picture)
         axes.set_title(title, fontsize=9, color="#555b66")
 
 

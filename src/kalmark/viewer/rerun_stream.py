@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,11 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import PluginError
 from kalmark.geometry.rotations import from_matrix
+from kalmark.picture_options import Picture
 from kalmark.results.measures import anees_interval
-from kalmark.results.plot import EUCLIDEAN_COLOUR, LANDMARK_COLOUR, LINE_COLOUR, OTHER_COLOUR, VIEWS
+from kalmark.results.plot import BEHIND, GROUPS, VIEWS
 from kalmark.results.scene import (
+    EXPECTED,
     INK,
     OUTCOME_COLOURS,
     TRUTH_COLOUR,
@@ -38,6 +41,8 @@ from kalmark.results.truth import poses_of_size
 INSTALL = "rerun is not installed, expected it for this view: pip install 'kalmark[view]'"
 LOOPBACK = "127.0.0.1"
 PATIENCE_S = 3.0  # after which a viewer has opened its window, or has ended
+SHAPE = 0.625  # height of a window as a part of its width
+SPIN = 0.2  # of the eye in an orbit
 QUALITY = 75  # of an image, compressed as JPEG
 MARK, LINE, BEAM = -2.5, -1.2, -0.5  # radii; negative ones are points of the screen
 POSES = {3: ("x (m)", "y (m)", "heading (rad)"), 6: ("x (m)", "y (m)", "z (m)", "about x", "about y", "about z (rad)")}
@@ -56,7 +61,7 @@ class Stream:
         self.path, self.d, self.last = path, scene.d, dict[str, Array]()
         self.picture, self.colours = scene.picture, {robot: scene.colour(robot) for robot in scene.paths}
         if path is None:
-            self.recording.connect_grpc(start_viewer())
+            self.recording.connect_grpc(start_viewer(scene.picture.width_px))
         else:
             path.parent.mkdir(parents=True, exist_ok=True)
             self.recording.save(str(path))
@@ -73,12 +78,11 @@ class Stream:
 
     def _describe(self, scene: Scene) -> None:
         """Log what does not change: the bodies of robots, true landmarks, names of curves and the arrangement."""
-        rr = self.rr
+        rr, true = self.rr, rgb(scene.picture.colour("truth", TRUTH_COLOUR))
         self.put("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for robot in scene.paths:
             colour, lines = scene.colour(robot), scene.body(robot)
             self.put(f"map/robots/{robot}/body", rr.LineStrips3D(lines, colors=rgb(colour), radii=LINE), static=True)
-            true = rgb(scene.picture.colour("truth", TRUTH_COLOUR))
             if scene.picture.truth:
                 self.put(f"map/true_robots/{robot}/body", rr.LineStrips3D(lines, colors=true, radii=LINE), static=True)
             names = POSES[3 if scene.d == 2 else 6]
@@ -87,15 +91,16 @@ class Stream:
         self.put("consistency/NIS", rr.SeriesLines(names=["NIS per degree of freedom"]), static=True)
         places = [l[:2] if self.d == 2 else l[:3] for l in scene.true_points().values()]
         if scene.picture.truth and places:
-            points = rr.Points3D(xyz(np.array(places)), colors=rgb(INK), radii=MARK)
+            points = rr.Points3D(xyz(np.array(places)), colors=true, radii=MARK)
             self.put("map/true_landmarks", points, static=True)
         if scene.picture.truth and scene.true_lines():
-            self.put("map/true_lines", rr.LineStrips3D([*map(xyz, scene.true_lines())], colors=rgb(INK)), static=True)
+            self.put("map/true_lines", rr.LineStrips3D([*map(xyz, scene.true_lines())], colors=true), static=True)
         self.recording.send_blueprint(self._arranged(scene))
 
     def _arranged(self, scene: Scene) -> Any:
         import rerun.blueprint as rrb
 
+        rr = self.rr
         forever = rrb.VisibleTimeRanges(
             [
                 rrb.VisibleTimeRange(
@@ -105,8 +110,20 @@ class Stream:
             ]
         )
         paths = [f"map/paths/{robot}" for robot in scene.paths] + [f"map/true_paths/{robot}" for robot in scene.paths]
-        eye = eye_of(scene)
-        look = rrb.EyeControls3D(position=eye[0], look_target=eye[1], eye_up=eye[2])
+        view, first = scene.picture.view, next(iter(scene.paths))
+        behind, (position, target, up) = view == "self" and self.d == 3, eye_of(scene)
+        if behind:
+            offset, axes = eye_behind(scene.size)
+            place = rr.Transform3D(translation=offset, mat3x3=axes)
+            plane = rr.Pinhole(fov_y=1.0, aspect_ratio=1.5, image_plane_distance=0.01 * scene.size, color=[0, 0, 0, 0])
+            self.put(f"map/robots/{first}/behind", place, plane, static=True)
+        look = rrb.EyeControls3D(
+            position=position,
+            look_target=target,
+            eye_up=up,
+            spin_speed=SPIN if view == "orbit" else None,
+            tracking_entity=f"map/robots/{first}/behind" if behind else None,
+        )
         three = rrb.Spatial3DView(origin="map", name="map", overrides=dict.fromkeys(paths, forever), eye_controls=look)
         figures = [
             rrb.TimeSeriesView(origin="consistency/NEES", name="NEES of the pose"),
@@ -136,7 +153,8 @@ class Stream:
             self.put(f"map/robot_ellipses/{name}", ellipsoid)
         self.put(f"sigma/{name}", rr.Scalars(np.sqrt(np.maximum(np.diagonal(P), 0.0))))
         if np.isfinite(true).all() and self.picture.truth:
-            self._move(f"map/true_robots/{name}", f"map/true_paths/{name}", true, TRUTH_COLOUR)
+            colour = self.picture.colour("truth", TRUTH_COLOUR)
+            self._move(f"map/true_robots/{name}", f"map/true_paths/{name}", true, colour)
         if np.isfinite(nees):
             self.put(f"consistency/NEES/{name}", rr.Scalars([nees, *anees_interval(len(P))]))
 
@@ -151,8 +169,7 @@ class Stream:
         """Log the landmarks of a map: points, ellipsoids, lines and tags, by their groups."""
         rr, shapes = self.rr, scene.shapes
         plane = self.d == 2
-        usual = (LANDMARK_COLOUR,) * 2 + (LINE_COLOUR,) if plane else (EUCLIDEAN_COLOUR, OTHER_COLOUR, LINE_COLOUR)
-        colours = [scene.picture.colour(key, c) for key, c in zip(("landmarks", "others", "lines"), usual, strict=True)]
+        colours = [scene.picture.colour(name, usual) for usual, name, _ in GROUPS[self.d]]
         known = np.isfinite(shapes.means).all(axis=1) & np.isfinite(shapes.covariances).all(axis=(1, 2))
         mine = np.array([rgb(colours[group]) for group in shapes.group[known].tolist()]).reshape(-1, 3)
         names = [str(scene.ids[row]) for row in shapes.row[known].tolist()]
@@ -189,6 +206,8 @@ class Stream:
     def scan(self, scene: Scene) -> None:
         """Log the observations of a scan in the colours of their outcomes, with lines to the landmarks."""
         rr = self.rr
+        if not scene.picture.sensors:
+            return
         seen = [ray for ray in scene.rays if np.isfinite(ray.seen_at).all()]
         ends = [(ray, ray.seen_at if np.isfinite(ray.seen_at).all() else ray.landmark) for ray in scene.rays]
         beams = [(ray, end) for ray, end in ends if np.isfinite(end).all()]
@@ -215,7 +234,7 @@ class Stream:
         if picture is not None:
             self.put(f"{entity}/pixels", rr.Image(picture).compress(jpeg_quality=QUALITY))
         else:
-            self.put(f"{entity}/border", rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgb(INK)))
+            self.put(f"{entity}/border", rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgb(TRUTH_COLOUR)))
         measured = [(point, s.outcome) for s in image.sightings for point in s.measured]
         colours = [rgb(OUTCOME_COLOURS.get(outcome, INK)) for _, outcome in measured]
         self.put(f"{entity}/measured", rr.Points2D([point for point, _ in measured], colors=colours, radii=2.5))
@@ -227,7 +246,7 @@ class Stream:
             for s in expected
         ]
         lines = rr.LineStrips2D(
-            strips, colors=[rgb(colour_of(s)[0]) for s in expected], labels=[s.name for s in expected],
+            strips, colors=[rgb(colour_of(s, self.picture)[0]) for s in expected], labels=[s.name for s in expected],
             show_labels=self.picture.labels,
         )  # fmt: skip
         self.put(f"{entity}/expected", lines)
@@ -263,6 +282,16 @@ def rgb(colour: str) -> list[int]:
     return [round(255 * part) for part in to_rgb(colour)]
 
 
+def light_colours(scene: Scene) -> Picture:
+    """Return the picture's options with usual colours that are mixed with white: the viewer is dark."""
+    usual = {name: colour for colour, name, _ in GROUPS[scene.d]}
+    usual |= {name: colour for name, colour, _ in EXPECTED.values()} | {
+        robot: scene.colour(robot) for robot in scene.paths
+    }
+    light = {name: "#" + bytes(round(0.6 * part + 102) for part in rgb(colour)).hex() for name, colour in usual.items()}
+    return replace(scene.picture, colours=light | dict(scene.picture.colours or {}))
+
+
 def eye_of(scene: Scene) -> tuple[Array, Array, Array]:
     """Return the position of the eye, the point that it looks at, and the direction upwards, by the picture's view."""
     low, high = (xyz(corner[None])[0] for corner in (scene.low, scene.high))
@@ -274,10 +303,18 @@ def eye_of(scene: Scene) -> tuple[Array, Array, Array]:
     return middle + 0.9 * float(np.linalg.norm(high - low)) * ahead, middle, up
 
 
-def start_viewer() -> str:
+def eye_behind(size: float) -> tuple[Array, Array]:
+    """Return the place (3,) of the eye behind a robot in its frame, and its axes (3, 3): right, down, ahead."""
+    elevation, _, share = BEHIND
+    e = np.radians(elevation)
+    ahead, right = np.array([np.cos(e), 0.0, -np.sin(e)]), np.array([0.0, -1.0, 0.0])
+    return -share * size * ahead, np.column_stack([right, np.cross(ahead, right), ahead])
+
+
+def start_viewer(width_px: float | None = None) -> str:
     """Start the viewer on a free port of 127.0.0.1, without its statistics, and return its address.
 
-    Raises PluginError if there is none.
+    Its window has its usual width or another one.  Raises PluginError if there is none.
     """
     folders = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     executable = shutil.which("rerun", path=folders)
@@ -287,6 +324,7 @@ def start_viewer() -> str:
         free.bind((LOOPBACK, 0))
         port = free.getsockname()[1]
     command = [executable, "--bind", LOOPBACK, "--port", str(port), "--expect-data-soon", "--hide-welcome-screen"]
+    command += [] if width_px is None else ["--window-size", f"{width_px:.0f}x{SHAPE * width_px:.0f}"]
     quiet = os.environ | {"CI": "true", "RUST_LOG": "error"}  # rerun sends no statistics of what runs in a CI
     with tempfile.TemporaryFile("w+") as errors:
         viewer = subprocess.Popen(command, env=quiet, stderr=errors, start_new_session=True)

@@ -24,7 +24,7 @@ from kalmark.results.measures import nees, nis, pose_error
 from kalmark.results.recording import Recording
 from kalmark.results.scene import Ray, Scene, images, images_of_report, map_shapes, picture_of, steps_of
 from kalmark.results.truth import as_rigid, poses_of_size
-from kalmark.viewer.rerun_stream import Stream
+from kalmark.viewer.rerun_stream import Stream, light_colours
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
@@ -46,6 +46,8 @@ def follow(slam: Slam, log: Log, picture: Picture, save: Path | None = None) -> 
     """
     picture = _world(picture)
     scene = scene_of_filter(slam, log, (), None, picture)
+    picture = light_colours(scene)
+    scene = replace(scene, picture=picture)
     size = 3 if scene.d == 2 else 7
     stream, to_map = Stream(log.name, scene, save), truth_to_map(slam, log, size)
     scans = any(isinstance(event, Scan | Raw) for event in log.events)
@@ -96,8 +98,9 @@ def replay(run: Recording, save: Path | None = None) -> None:
     The covariance of the whole map is that at the end; in a run whose plug-ins are not trusted there is none, and no
     place of observations by sensors of ids.  Raises PluginError without rerun.
     """
-    history, picture = run.history, _world(picture_of(run))
-    scene = replace(Scene.of(run, world=True), picture=picture, true_landmarks=run.truth.landmarks_in_map())
+    history, scene = run.history, Scene.of(run, world=True)
+    scene = replace(scene, picture=_world(picture_of(run)), true_landmarks=run.truth.landmarks_in_map())
+    scene = replace(scene, picture=light_colours(scene))
     stream, pictures = Stream(run.log.name, scene, save), Pictures(run)
     try:
         slam = run.final_slam()

@@ -1,15 +1,14 @@
 "use strict";
-const INK = "#2b2f36", BAND = "rgba(31,95,168,0.13)";
 const OUTCOME = {associated: "#4a8f7b", new: "#d2a23c", rejected: "#c8553d", ignored: "#aab0ba",
                  deferred: "#7c86b8", tentative: "#b48ac0"};
 const CONFIG = {responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d"]};
 const el = id => document.getElementById(id);
-const axis = title => ({title: {text: title, standoff: 8}, gridcolor: "#e6e8ec", zeroline: false, linecolor: "#c4c8cf",
+const axis = title => ({title: {text: title, standoff: 8}, gridcolor: GRID, zeroline: false, linecolor: RIM,
                         automargin: true});
 const END = Math.max(0, ...DATA.robots.flatMap(r => r.t.slice(-1))) || 1;
 const timeAxis = () => ({...axis("time (s)"), range: [0, END]});
 const layout = extra => ({margin: {l: 64, r: 16, t: 10, b: 44}, font: {family: "system-ui, sans-serif", size: 13, color: INK},
-                          paper_bgcolor: "white", plot_bgcolor: "white", hovermode: "closest",
+                          paper_bgcolor: PAPER, plot_bgcolor: PAPER, hovermode: "closest",
                           legend: {orientation: "h", y: -0.12, x: 0}, ...extra});
 
 /* A logarithmic axis around values, with ticks that are plain numbers; at most the upper six decades. */
@@ -128,7 +127,7 @@ function drawErrors(robot) {
     traces.push(curve(robot.t, robot.error[i], robot.gaps, {line: {color: robot.colour, width: 1.1},
                       hovertemplate: `%{x:.1f} s: %{y:.4g}<extra>${name}</extra>`, ...at}));
     page["yaxis" + (i ? n : "")] = {...axis(name), domain: [1 - (row + 1) / 3 + 0.025, 1 - row / 3 - 0.01], zeroline: true,
-                                    zerolinecolor: "#c4c8cf", anchor: right ? "x2" : "x"};
+                                    zerolinecolor: RIM, anchor: right ? "x2" : "x"};
   });
   page.xaxis = {...timeAxis(), anchor: "y3", domain: [0, two ? 0.46 : 1]};
   if (two) page.xaxis2 = {...timeAxis(), anchor: "y6", domain: [0.54, 1], matches: "x"};
@@ -156,7 +155,7 @@ function drawNis() {
   const meaning = "the band would hold 95 % of them if observations were independent; those of a scan share the error of the pose, so more are outside";
   el("nis-note").textContent = `${nis.window > 1 ? `mean over windows of ${nis.window} scans` : "each scan"}; ${meaning}`;
   Plotly.react("nis", [band(nis.t, nis.low, nis.high, nis.gaps),
-    curve(nis.t, nis.value, nis.gaps, {line: {color: "#1f5fa8", width: 1.1},
+    curve(nis.t, nis.value, nis.gaps, {line: {color: BLUE, width: 1.1},
           hovertemplate: "%{x:.1f} s: %{y:.3g}<extra></extra>"}),
     {x: [nis.t[0], nis.t[nis.t.length - 1]], y: [1, 1], mode: "lines", line: {color: INK, width: 1, dash: "dot"}, hoverinfo: "skip"}],
     layout({height: 280, showlegend: false, xaxis: timeAxis(), yaxis: logAxis("NIS / dof", [...nis.value, ...nis.low, ...nis.high])}), CONFIG);
@@ -173,7 +172,7 @@ function drawFixes(robot) {
       {x: robot.rejected.t, y: robot.rejected.z[i], mode: "markers", hovertemplate, ...at,
        marker: {symbol: "x-thin", size: 7, line: {color: OUTCOME.rejected, width: 1.5}}});
     page["yaxis" + (i ? i + 1 : "")] = {...axis("xyz"[i] + " (m)"), domain: [1 - (i + 1) / count + 0.025, 1 - i / count - 0.01],
-                                        zeroline: true, zerolinecolor: "#c4c8cf"};
+                                        zeroline: true, zerolinecolor: RIM};
   });
   const range = [Math.min(0, robot.t[0]), Math.max(END, robot.t[robot.t.length - 1])];
   page.xaxis = {...axis("time (s)"), range, anchor: "y" + (count > 1 ? count : "")};
@@ -189,13 +188,13 @@ function ofEach(robots, choice, section, draw) {
   inView(section, () => draw(robots[+el(choice).value]));
 }
 
-const CHANGE = {merged: ["#1f5fa8", "triangle-down"], removed: ["#c8553d", "x-thin"]};
+const CHANGE = {merged: [BLUE, "triangle-down"], removed: ["#c8553d", "x-thin"]};
 
 /* One ambiguous scan: observations, the landmarks each was compared with, and the decision. */
 function drawScan(scan) {
   const traces = [], ring = contours(scan.pose, [0], 24, "xy");
-  traces.push({...ring, mode: "lines", line: {color: "#1f5fa8", width: 1}, name: `robot, ${SIGMAS}`, hoverinfo: "skip"},
-    {x: scan.pose.x, y: scan.pose.y, mode: "markers", marker: {color: "#1f5fa8", size: 9}, showlegend: false,
+  traces.push({...ring, mode: "lines", line: {color: BLUE, width: 1}, name: `robot, ${SIGMAS}`, hoverinfo: "skip"},
+    {x: scan.pose.x, y: scan.pose.y, mode: "markers", marker: {color: BLUE, size: 9}, showlegend: false,
      hovertemplate: `${scan.robot}<extra></extra>`});
   const named = new Set();
   for (const seen of scan.seen.filter(s => s.x !== null)) {

@@ -1,9 +1,18 @@
 "use strict";
 /* The map of a run, in the plane or in space, where it turns under the mouse, and the images of cameras at the slider. */
 const AXES = DATA.dof === 3 ? ["x", "y"] : ["x", "y", "z"], SPACE = AXES.length === 3;
-const PICTURE = DATA.picture, colourOf = (name, usual) => PICTURE.colours[name] || usual;
-const TRUTH = colourOf("truth", SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)"), FIX = "#7a3fa0", GROUND = "#cfd4dc", TAG = "#1f5fa8", POSE = "#d62f2f", LINE = colourOf("lines", "#8c1c13"), ALARM = "#b3261e", KNOWN = "#2f7d4f";
-const MEASURED = "#7d838d", SEGMENT = "rgba(58,104,200,0.55)";
+const style = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+const [INK, PAPER, GRID, RIM] = ["ink", "card", "line", "rim"].map(style), dusk = matchMedia("(prefers-color-scheme: dark)"), DARK = dusk.matches;
+dusk.addEventListener("change", () => location.reload());
+
+/* A colour of a white page; on a dark one it is mixed with white. */
+const tone = colour => !DARK ? colour : "#" + [1, 3, 5].map(k => Math.round(0.6 * parseInt(colour.slice(k, k + 2), 16) + 102).toString(16)).join("");
+const PICTURE = DATA.picture, colourOf = (name, usual) => PICTURE.colours[name] || tone(usual);
+for (const robot of [...DATA.robots, ...DATA.innovations]) robot.colour = colourOf(robot.name, robot.colour);
+const BLUE = tone("#1f5fa8"), BAND = DARK ? "rgba(121,159,203,0.25)" : "rgba(31,95,168,0.13)";
+const TRUTH = PICTURE.colours.truth || (SPACE ? "#9aa1ab" : "rgba(139,146,156,0.6)"), FIX = tone("#7a3fa0"), GROUND = RIM, TAG = BLUE;
+const POSE = tone("#d62f2f"), LINE = colourOf("lines", "#8c1c13"), ALARM = tone("#b3261e"), KNOWN = tone("#2f7d4f"), NAME = tone("#1e4d2b");
+const MEASURED = colourOf("measured", "#7d838d"), SEGMENT = PICTURE.colours.measured || "rgba(58,104,200,0.55)";
 const SIGMAS = PICTURE.sigmas ? `, ${PICTURE.sigmas} sigma ${DATA.ellipses}` : "";
 const GROUPS = !SPACE ? [[colourOf("landmarks", "#d2691e"), `landmarks${SIGMAS}`]] :
   [[colourOf("landmarks", "#1f5fa8"), `landmarks${SIGMAS}`], [colourOf("others", "#c8412f"), `landmarks that are not Euclidean${SIGMAS}`],
@@ -45,8 +54,13 @@ function contours(g, rows, points = 24, axes = AXES, sigmas = PICTURE.sigmas) {
   return axes.length === 3 ? boxed(out) : out;
 }
 
-/* A polyline of a robot's frame placed at its pose at step i. */
+/* A polyline of a robot's frame placed at a pose of it, nothing if that is not known. */
 function placed(body, r, i) {
+  if (i < 0 || r.x[i] === null) return along(() => []);
+  if (!SPACE) {
+    const c = Math.cos(r.theta[i]), s = Math.sin(r.theta[i]), y = body.y;
+    return {x: body.x.map((v, k) => v === null ? null : r.x[i] + c * v - s * y[k]), y: body.x.map((v, k) => v === null ? null : r.y[i] + s * v + c * y[k])};
+  }
   const [x, y, z, w] = r.q.map(q => q[i]);
   const Q = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
              [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -56,6 +70,7 @@ function placed(body, r, i) {
 }
 
 const KIND = SPACE ? {type: "scatter3d", connectgaps: false} : {}, quiet = {showlegend: false};
+const WAY = `true path and robot${DATA.how}`;
 const WHERE = AXES.map(k => `%{${k}:.3f}`).join(", ");
 
 /* A line of the map; widths are those of the plane, in space lines are thinner than they are said to be. */
@@ -93,7 +108,7 @@ function still() {
   each(Object.values(DATA.usedFixes), "fixes used", f => marks(f, thin("x", FIX), [5, 2], skip));
   const thinly = r => { const s = stroke(r.dead, r.colour, 0.9, {opacity: 0.5}); return {...s, line: {...s.line, dash: "dash"}}; };
   each(DATA.robots.filter(r => r.dead), "dead reckoning", thinly);
-  each(DATA.robots.filter(r => PICTURE.truth && r.truth), `true path${DATA.how}`, r => stroke(r.truth, TRUTH, SPACE ? 1.6 : 3));
+  each(DATA.robots.filter(r => PICTURE.truth && r.truth), WAY, r => stroke(along(k => broken(r.truth[k], r.gaps)), TRUTH, SPACE ? 1.6 : 3));
   if (DATA.repeats.x.length) traces.push(stroke(DATA.repeats, ALARM, 1.2, {...skip, name: "landmarks mapped twice"}));
   if (PICTURE.truth && DATA.trueLines.x.length) traces.push(stroke(DATA.trueLines, TRUTH, 1.6, {name: `true lines${DATA.how}`}));
   if (PICTURE.truth && l.x.length)
@@ -108,13 +123,10 @@ function still() {
   return traces;
 }
 
-/* A dart that points along the heading of a robot of the plane. */
-const DART = [[0.62, 0], [-0.38, 0.36], [-0.16, 0], [-0.38, -0.36], [0.62, 0]];
-function dart(r, at) {
-  const size = 0.035 * Math.max(...DATA.box.high.map((v, a) => v - DATA.box.low[a]));
-  const turned = (i, [f, l]) => [f * Math.cos(r.theta[i]) - l * Math.sin(r.theta[i]), f * Math.sin(r.theta[i]) + l * Math.cos(r.theta[i])];
-  const points = at.flatMap(i => DART.map(p => turned(i, p)).map(([x, y]) => [r.x[i] + size * x, r.y[i] + size * y]));
-  return {x: points.map(p => p[0]), y: points.map(p => p[1])};
+/* The body of a robot at a pose: a filled outline in the plane, lines in space. */
+function bodyAt(r, poses, i, colour, extra) {
+  const body = stroke(placed(DATA.bodies[r.name], poses, i), colour, 1.2, extra);
+  return SPACE ? body : {...body, fill: "toself", fillcolor: colour, line: {color: PAPER, width: 1}};
 }
 
 /* A map that was kept, and the robots at a time. */
@@ -138,9 +150,9 @@ function moving(map, now) {
     traces.push(stroke(pathOf(r, n, AXES), r.colour, 1.6, {name, legendgroup: r.name}));
     const dotted = stroke(bridgesOf(r, n, AXES), r.colour, 1.6, own);
     traces.push({...dotted, line: {...dotted.line, dash: "dot"}});
-    if (SPACE) traces.push(stroke(n ? placed(DATA.bodies[r.name], r, n - 1) : along(() => []), r.colour, 1.2, own));
-    else traces.push({...dart(r, at), mode: "lines", ...own, fill: "toself", fillcolor: r.colour,
-                      line: {color: "white", width: 1}, hovertemplate: `${r.name}: ${WHERE}<extra></extra>`});
+    if (PICTURE.truth && r.truth)
+      traces.push(bodyAt(r, r.truth, n - 1, colourOf("truth", "#7b828c"), {legendgroup: WAY, ...quiet, hoverinfo: "all", hovertemplate: `true ${r.name}: ${WHERE}<extra></extra>`}));
+    traces.push(bodyAt(r, r, n - 1, r.colour, {...own, hoverinfo: "all", hovertemplate: `${r.name}: ${WHERE}<extra></extra>`}));
     traces.push(stroke(contours(r, at, 48), SPACE ? POSE : r.colour, SPACE ? 0.8 : 1.4,
                        {name: `robot${SIGMAS}`, legendgroup: "pose", showlegend: SPACE && i === 0}));
   });
@@ -170,10 +182,26 @@ function turned(camera, degrees) {
   return {...camera, eye: {x: c * x - s * y, y: s * x + c * y, z}};
 }
 
+/* The box of space: its sides, and how many metres are one unit of plotly's scene. */
+function spaceBox() {
+  const {low, high} = DATA.box, spans = high.map((v, a) => v - low[a]);
+  return {low, high, spans, unit: Math.max(...spans) / (PICTURE.flat ? 2 : 1.05)};
+}
+
+/* The camera behind a robot at a time, which looks along its x axis: elevation, azimuth and distance are the picture's. */
+function cameraBehind(r, now) {
+  const {low, high, unit} = spaceBox(), at = Math.max(upTo(r.t, now) - 1, 0), [x, y, z, w] = r.q.map(q => q[at]);
+  const [elevation, turn, distance] = PICTURE.behind, rad = Math.PI / 180, cos = Math.cos(elevation * rad);
+  const azimuth = turn * rad + Math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z));
+  const center = along(k => (r[k][at] - (low["xyz".indexOf(k)] + high["xyz".indexOf(k)]) / 2) / unit);
+  const away = {x: cos * Math.cos(azimuth), y: cos * Math.sin(azimuth), z: Math.sin(elevation * rad)};
+  return {center, eye: along(k => center[k] + distance / unit * away[k]), up: {x: 0, y: 0, z: 1}};
+}
+
 function spatialPage() {
-  const {low, high} = DATA.box, spans = high.map((v, a) => v - low[a]), unit = Math.max(...spans) / (PICTURE.flat ? 2 : 1.05);
-  const side = (title, a) => ({title: {text: title}, range: [low[a], high[a]], backgroundcolor: "white", gridcolor: "#e6e8ec",
-                               zerolinecolor: "#e6e8ec", showspikes: false});
+  const {low, high, spans, unit} = spaceBox();
+  const side = (title, a) => ({title: {text: title}, range: [low[a], high[a]], backgroundcolor: PAPER, gridcolor: GRID,
+                               zerolinecolor: GRID, showspikes: false});
   return layout({height: 640, uirevision: "map", margin: {l: 0, r: 0, t: 0, b: 0}, legend: {orientation: "h", y: 0.02, x: 0.02},
     scene: {aspectmode: "manual", aspectratio: {x: spans[0] / unit, y: spans[1] / unit, z: spans[2] / unit}, uirevision: "map",
             xaxis: side("x (m)", 0), yaxis: side("y (m)", 1), zaxis: side("z (m)", 2),
@@ -182,6 +210,7 @@ function spatialPage() {
 
 /* The picture of a map: a function that draws the map of a number and the robots at a time, and images if they are in view. */
 function mapPicture() {
+  if (PICTURE.sensorWidth) el("images").style.gridTemplateColumns = `repeat(auto-fit, min(100%, ${PICTURE.sensorWidth}px))`;
   const background = still(), page = SPACE ? spatialPage() : planarPage();
   let shownMap = 0;
   const images = () => DATA.cameras.forEach((camera, i) => drawImages(camera, i, shownMap));
@@ -189,7 +218,8 @@ function mapPicture() {
   return (kept, now, playing) => {
     shownMap = kept;
     const shown = el("map")._fullLayout?.scene?._scene;  /* the slider must not turn the view back */
-    if (shown) page.scene.camera = PICTURE.orbit && playing ? turned(shown.getCamera(), 3) : shown.getCamera();
+    if (SPACE && PICTURE.behind) Object.assign(page.scene, {camera: cameraBehind(DATA.robots[0], now), uirevision: now});
+    else if (shown) page.scene.camera = PICTURE.orbit && playing ? turned(shown.getCamera(), 3) : shown.getCamera();
     Plotly.react("map", [...background, ...moving(DATA.maps[kept], now)], page, CONFIG);
     if (!waiting.has(el("images"))) images();
   };
@@ -219,6 +249,7 @@ function drawImages(camera, i, frame) {
 }
 
 function drawImage(id, camera, scan, image) {
+  const shown = image.picture ? colour => colour : tone;  /* on the paper, or on an image */
   const {size} = camera, lines = new Map(), marks = {new: [], rejected: [], measured: []}, names = {x: [], y: [], text: []};
   const add = (colour, name, dash, width, points) => {
     const key = colour + dash;
@@ -233,8 +264,8 @@ function drawImage(id, camera, scan, image) {
     if (s.outcome in marks) marks[s.outcome].push(...s.y.map(p => [...p, s.name]));
     if (s.e && single && s.Z) {
       const e = contours({x: [s.e[0][0]], y: [s.e[0][1]], pxx: [s.Z[0]], pxy: [s.Z[1]], pyy: [s.Z[2]]}, [0], 32, "xy", 3);
-      add(s.colour, s.meaning, dash, 1.4, e.x.slice(0, -1).map((x, k) => [x, e.y[k]]));
-    } else if (s.e) add(s.colour, s.meaning, dash, 1.4, s.e.length === 2 ? trimmed(s.e, size) : close(s.e));
+      add(shown(s.colour), s.meaning, dash, 1.4, e.x.slice(0, -1).map((x, k) => [x, e.y[k]]));
+    } else if (s.e) add(shown(s.colour), s.meaning, dash, 1.4, s.e.length === 2 ? trimmed(s.e, size) : close(s.e));
     if (s.name && s.outcome !== "ignored" && image.seen.length <= 30) {
       const at = s.e && single ? s.e : s.y, mean = a => at.reduce((sum, p) => sum + p[a], 0) / at.length;
       names.x.push(mean(0)); names.y.push(mean(1) - 15); names.text.push(s.name);
@@ -247,10 +278,10 @@ function drawImage(id, camera, scan, image) {
     sizing: "stretch", layer: "below"}] : [];
   const title = `${camera.name}${image.side ? " · " + image.side : ""}${scan ? ` · ${scan.t.toFixed(2)} s` : ""}`;
   Plotly.react(id, [
-    dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: image.picture ? "#ffd400" : MEASURED, width: 1.3}}), ...lines.values(),
-    dots(marks.new, "new", {symbol: "square-open", size: 10, color: "#1e4d2b"}),
+    dots(marks.measured, "measured", {symbol: "cross-thin", size: 9, line: {color: PICTURE.colours.measured || (image.picture ? "#ffd400" : MEASURED), width: 1.3}}), ...lines.values(),
+    dots(marks.new, "new", {symbol: "square-open", size: 10, color: NAME}),
     dots(marks.rejected, "rejected", {symbol: "x-thin", size: 9, line: {color: INK, width: 1.6}}),
-    {...names, mode: "text", textfont: {size: 10, color: "#1e4d2b"}, hoverinfo: "skip", showlegend: false}],
+    {...names, mode: "text", textfont: {size: 10, color: NAME}, hoverinfo: "skip", showlegend: false}],
     layout({height: high + 100, title: {text: title, x: 0.01, font: {size: 13}}, margin: {l: 44, r: 10, t: 30, b: 70},
             images: picture,
             xaxis: {...axis(""), range: [0, size[0]], constrain: "domain", mirror: true, showline: true},
