@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import FunctionType
+from typing import Any
 from unittest.mock import patch
 
 import numba
@@ -91,6 +93,8 @@ def test_a_job_that_fails_is_not_taken_for_done(tmp_path: Path) -> None:
 DAMAGED = """
 import sys
 from pathlib import Path
+from types import FunctionType
+from typing import Any
 from unittest.mock import patch
 import numpy as np
 from kalmark.compiled import compiled
@@ -212,3 +216,13 @@ def test_the_filter_runs_without_compilation_as_it_does_with_it() -> None:
         told.append(np.array([line.split() for line in done.stdout.splitlines()], dtype=np.float64))
     assert told[1] == pytest.approx(told[0], rel=1e-6)
     assert told[0][-1, 0] == 84  # a compressed map
+
+
+def test_errors_of_slices_are_short_in_inner_loops_alone() -> None:
+    def assign(to: Any, numbers: Any) -> None:
+        to[:3] = numbers
+
+    own = FunctionType(assign.__code__, {"__name__": "kalmark.models.some"}, "assign")
+    for function, error in ((compiled.compiled(own), "slice of another size"), (numba.njit(assign), r"shape \(4,\)")):
+        with pytest.raises(ValueError, match=error):
+            function(np.zeros(5), np.zeros(4))

@@ -42,12 +42,15 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataC
 from numba.core.sigutils import normalize_signature
 from numba.core.typing.templates import Signature
 from numba.extending import intrinsic, overload
+from numba.np import arrayobj
 
 from kalmark.files import hold_lock
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 COMPILING = "kalmark: compiling its inner loops, this once for this kind of run; it can take half a minute\n"
+
+ERROR_WITH_SIZES = vars(arrayobj).get("raise_with_shape_context")  # of numba
 
 LONGEST_WAIT_S = 300.0  # for another process that compiles the same function
 
@@ -271,18 +274,42 @@ def wait_for_compilation(function: Any) -> None:
         process.wait()
 
 
-class _Announcer(event.Listener):  # type: ignore[misc, unused-ignore]
-    """Note when an inner loop is being compiled; one loaded from the disk is not, and many workers note nothing."""
+def refuse_sizes(src_shapes: Any, index_shape: Any) -> None:
+    """Stand for numba's error of a slice and numbers of other sizes, in compiled code."""
+    raise NotImplementedError
+
+
+@overload(refuse_sizes, strict=False)  # type: ignore[untyped-decorator]
+def _message_without_sizes(src_shapes: Any, index_shape: Any) -> Any:
+    def size_error(src_shapes: Any, index_shape: Any) -> None:
+        raise ValueError("cannot assign numbers to a slice of another size")
+
+    return size_error
+
+
+class _CompilationListener(event.Listener):  # type: ignore[misc, unused-ignore]
+    """Note when an inner loop is being compiled; one loaded from the disk is not, and many workers note nothing.
+
+    Of slices it has no sizes in its errors: numba would compile its handling of text for them, in each process.
+    """
+
+    depth = 0
 
     def on_start(self, event: Any) -> None:
-        if event.data["dispatcher"].py_func.__module__.startswith("kalmark.") and parent_process() is None:
+        if self._count(event, 1) and parent_process() is None:
             say_compiling()
 
     def on_end(self, event: Any) -> None:
-        pass
+        self._count(event, -1)
+
+    def _count(self, event: Any, by: int) -> bool:
+        own: bool = event.data["dispatcher"].py_func.__module__.startswith("kalmark.")
+        self.depth += by * own
+        arrayobj.raise_with_shape_context = refuse_sizes if self.depth else ERROR_WITH_SIZES
+        return own
 
 
-event.register("numba:compile", _Announcer())
+event.register("numba:compile", _CompilationListener())
 
 
 def by_address(signature: Signature) -> Callable[[int, tuple[Any, ...]], Any]:

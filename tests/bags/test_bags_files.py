@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from kalmark.errors import KalmarkError, LogError
+from kalmark.events import Event
 from kalmark.logs import open_log
 
 pytest.importorskip("rosbags", reason="rosbags is not installed: no bag can be read")
@@ -20,13 +22,27 @@ from ros_bags import (
     TOPICS,
     Outgoing,
     bag_of,
-    events_of,
     header_fields,
     odometry,
     pose,
+    robot_among_posts,
     same,
     twist,
+    write_bag,
 )
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return the bags of the first seconds of the robot among posts, by kind."""
+    folder, messages = tmp_path_factory.mktemp("bags"), robot_among_posts()[:600]
+    return {kind: write_bag(folder, kind, messages) for kind in KINDS}
+
+
+@cache
+def events_of(path: Path) -> list[Event]:
+    """Return the events of a bag, which is read once."""
+    return list(open_log(path, topics=TOPICS).events)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -183,7 +199,7 @@ def test_mcap_of_its_own_library_with_packed_chunks_or_none_is_the_same_log(
 def test_a_ros_2_bag_split_into_files_is_the_same_log(kind: str, bags: dict[str, Path], tmp_path: Path) -> None:
     """As `ros2 bag record` splits: several files, one metadata.yaml that lists them."""
     halves = [
-        copied(bags[kind], tmp_path / f"half{k}", "NONE", *part) for k, part in enumerate(((0, 900), (900, None)))
+        copied(bags[kind], tmp_path / f"half{k}", "NONE", *part) for k, part in enumerate(((0, 300), (300, None)))
     ]
     whole = tmp_path / "split"
     whole.mkdir()

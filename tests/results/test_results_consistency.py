@@ -79,6 +79,7 @@ def test_the_nees_of_a_map_is_that_of_its_blocks_and_of_all_and_nothing_for_a_si
     each = np.array([np.einsum("ci,ci->c", e, np.linalg.solve(S, e.T).T) for e, S in blocks])
     expected = [*each[:3].mean(axis=0), 11 / 3, *each[3], n]
     np.testing.assert_allclose(map_nees(d, P, first, sizes), expected, rtol=1e-6)
+    np.testing.assert_allclose(nees(d, np.stack([P, P])), expected[3:5], rtol=1e-6)
     A[4] = 2.0 * A[3]  # the first block, hence all
     np.testing.assert_allclose(map_nees(d, A @ A.T, first, sizes)[:3], [*each[1:3].mean(axis=0), 4.5], rtol=1e-6)
     assert np.isnan(map_nees(d, A @ A.T, first, sizes)[3:]).all()
@@ -123,11 +124,13 @@ def test_the_most_of_a_mean_nees_is_that_of_one_value_for_an_error_that_lasts_an
 
 @pytest.mark.parametrize("rho", [0.9, 0.99, 0.999])
 def test_hardly_a_consistent_run_of_errors_that_last_has_a_mean_nees_above_what_it_may_be(rho: float) -> None:
-    rng, P, above = np.random.default_rng(3), np.tile(np.eye(3), (400, 1, 1)), 0
-    for _ in range(1000):
-        d, step = rng.normal(size=(400, 3)), np.sqrt(1.0 - rho**2)
-        for k in range(1, 400):
-            d[k] = rho * d[k - 1] + step * d[k]
-        above += float(np.mean(nees(d, P))) > nees_limit(d, P)
-        assert float(np.mean(nees(10.0 * d, P))) > nees_limit(10.0 * d, P) or rho == 0.999
+    P, above = np.tile(np.eye(3), (400, 1, 1)), 0
+    errors, step = np.random.default_rng(3).normal(size=(1000, 400, 3)), np.sqrt(1.0 - rho**2)
+    for k in range(1, 400):
+        errors[:, k] = rho * errors[:, k - 1] + step * errors[:, k]
+    for d, mean in zip(errors, nees(errors, np.tile(P, (1000, 1, 1, 1))).mean(axis=1).tolist(), strict=True):
+        limit = nees_limit(d, P)
+        above += mean > limit
+        assert 100.0 * mean > limit or rho == 0.999
+    assert nees_limit(10.0 * errors[0], P) == pytest.approx(nees_limit(errors[0], P))
     assert above <= 2

@@ -13,6 +13,7 @@ tag      its pose                                                              6
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -234,6 +235,7 @@ class _Scorer:
             if mount.cov is not None and mount.cov.any()
         }
         self.nis, self.nis_dof = 0.0, 0
+        self.states = defaultdict[int, list[tuple[int, Array, Array]]](list)  # by row: steps, errors, covariances
 
     def after(self, report: Report, scan: Scan) -> None:
         """Take in one scan."""
@@ -250,7 +252,7 @@ class _Scorer:
         if len(mean) > self.mean.shape[-1]:
             turn = robot_turn(mean, self._state(scan.robot, k))
             d = state_error(mean, self._state(scan.robot, k), turn, self.slam.estimator.coordinates)
-            self.series["state"][row, k], self.series["state_dof"][row, k] = nees(d, P), len(d)
+            self.states[row].append((k, d, P))
         if (k + 1) % self.map_every == 0 or k == self.last:
             self._score_map(scan.robot, row, k)
 
@@ -322,6 +324,10 @@ class _Scorer:
 
     def scores(self, stopped: str) -> Scores:
         """Return the scores."""
+        for row, kept in self.states.items():
+            steps, errors, covariances = (np.array(one) for one in zip(*kept, strict=True))
+            self.series["state"][row, steps] = nees(errors, covariances)
+            self.series["state_dof"][row, steps] = errors.shape[1]
         d, robot = self.d, self.log.robots[0]
         mean = self.slam.mean(robot)
         judged = [j for _, j in self._landmarks(robot_turn(mean, self._state(robot, self.last)), mean[:d])]

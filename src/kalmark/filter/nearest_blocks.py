@@ -12,7 +12,6 @@ from kalmark.filter.layout import X_AT
 from kalmark.geometry.spaces import HEADING, RHO, VECTOR, VECTOR3, Space, Table
 
 TINY_M = 1e-9
-FEW = 16  # numbers to be kept in order
 
 Sorts = tuple[Index, Flags]  # by slot: a number of what is there, -1 for nothing to be found; by number: whether wanted
 
@@ -46,8 +45,6 @@ def kth_least(gaps: Array, count: int) -> float:
     """Return the `count`-th least of some gaps (N,), inf where there are fewer."""
     if not 0 < count <= len(gaps):
         return np.inf
-    if count > FEW:
-        return float(np.partition(gaps, count - 1)[count - 1])
     kept = np.full(count, np.inf)
     for gap in gaps:
         j = count - 1

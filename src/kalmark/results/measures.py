@@ -147,15 +147,12 @@ def log_translation(turn: float, x: float, y: float) -> tuple[float, float]:
 
 @compiled
 def all_in_log(turn: Array, d: Array) -> Array:
-    """Return V(turn)^-1 d (N, 2 or 3) of errors d with turns (N, 1 or 3): angles, or rotation vectors up to pi."""
+    """Return V(turn)^-1 d (N, 3) of errors d with turns (N, 3), rotation vectors up to pi."""
     out = np.empty_like(d)
     for i in range(len(d)):
-        if d.shape[1] == 2:
-            out[i, 0], out[i, 1] = log_translation(turn[i, 0], d[i, 0], d[i, 1])
-        else:
-            inverse = left_jacobian_inverse(turn[i])
-            for j in range(3):
-                out[i, j] = inverse[j, 0] * d[i, 0] + inverse[j, 1] * d[i, 1] + inverse[j, 2] * d[i, 2]
+        inverse = left_jacobian_inverse(turn[i])
+        for j in range(3):
+            out[i, j] = inverse[j, 0] * d[i, 0] + inverse[j, 1] * d[i, 1] + inverse[j, 2] * d[i, 2]
     return out
 
 
@@ -193,8 +190,12 @@ def point_error(mean: Array, truth: Array, dtheta: Any, coordinates: str) -> Arr
         return d
     if coordinates != "log":
         raise ValueError(f"coordinates is {coordinates!r}, expected 'world' or 'log'")
-    turn = np.asarray(dtheta) if d.shape[-1] == 3 else np.asarray(dtheta)[..., None]
-    return all_in_log(contiguous_rows(turn, (*d.shape[:-1], turn.shape[-1])), contiguous_rows(d)).reshape(d.shape)
+    turn = np.asarray(dtheta)
+    if d.shape[-1] == 3:
+        return all_in_log(contiguous_rows(turn, d.shape), contiguous_rows(d)).reshape(d.shape)
+    half = np.sinc(turn / (2.0 * np.pi))  # V^-1 is that of half the turn, scaled by a / 2 / sin(a / 2)
+    c, s = np.cos(0.5 * turn) / half, np.sin(0.5 * turn) / half
+    return np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]], axis=-1)
 
 
 def pose_error(mean: Array, truth: Array, coordinates: str = "world") -> Array:
@@ -253,22 +254,23 @@ def write_nees(d: Array, P: Array, at: int, n: int, out: Array) -> None:
         out[c] = np.sum(S[n + c, :n] ** 2) if inverse * SINGULAR < 1.0 else np.nan
 
 
-@compiled
-def all_nees(d: Array, P: Array) -> Array:
-    """Return the NEES (N,) of errors d (N, 1, n) with covariances P (N, n, n)."""
-    out = np.empty((len(d), 1))
-    for k in range(len(d)):
-        write_nees(d[k], P[k], 0, P.shape[1], out[k])
-    return out[:, 0]
-
-
 def nees(d: Array, P: Array) -> Array:
     """Return d^T P^-1 d (...) for errors (..., n) and covariances (..., n, n); NaN where P is singular.
 
-    Singular: a variance that is not positive, or tr C^-1 above 1e12, C being the correlation matrix.
+    Singular: a variance that is not positive, or tr C^-1 above 1e12, C being the correlation matrix.  As `write_nees`,
+    of all covariances at once.
     """
-    P = np.ascontiguousarray(P, dtype=np.float64)
-    return all_nees(contiguous_rows(d, P.shape[:-1])[:, None], P.reshape(-1, *P.shape[-2:])).reshape(P.shape[:-2])
+    P, variance = np.asarray(P, dtype=np.float64), np.einsum("...ii->...i", P)
+    with np.errstate(all="ignore"):
+        sigma = np.sqrt(variance)
+        C, scaled = P / (sigma[..., :, None] * sigma[..., None, :]), np.broadcast_to(d, sigma.shape) / sigma
+        S = np.concatenate([C, scaled[..., None, :], np.broadcast_to(np.eye(P.shape[-1]), P.shape)], axis=-2)
+        for k in range(P.shape[-1]):
+            S[..., k:, k] -= np.einsum("...ij,...j->...i", S[..., k:, :k], S[..., k, :k])
+            S[..., k:, k] /= np.sqrt(S[..., k, k])[..., None]
+        squares = np.sum(S[..., P.shape[-1] :, :] ** 2, axis=-1)
+        regular = np.all((variance > 0.0) & (variance < np.inf), axis=-1)
+        return np.where(regular & (np.sum(squares[..., 1:], axis=-1) * SINGULAR < 1.0), squares[..., 0], np.nan)
 
 
 @compiled
