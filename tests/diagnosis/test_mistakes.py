@@ -29,7 +29,9 @@ Change = Callable[[Event], Event]
 
 def run_of(log: Log, settings: tuple[str, ...] = ()) -> Run:
     config = load_world("random_field", [*FIELD, *settings]).config()
-    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config), on_error="skip")
+    return km.record(
+        build_slam(config, log), log, progress=False, config=config_dict(config), on_error="skip", pictures=False
+    )
 
 
 def log_of(change: Change, settings: tuple[str, ...] = ()) -> Log:

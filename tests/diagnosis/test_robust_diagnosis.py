@@ -41,7 +41,8 @@ def run_of(change: Callable[[Scan], Scan], seed: int = 3) -> Run:
     log = simulate(made, seed)
     events: list[Event] = [change(e) if isinstance(e, Scan) and e.ids else e for e in log.events]
     log = replace(log, events=events)
-    return km.record(build_slam(made.config(), log), log, progress=False, config=config_dict(made.config()))
+    config = made.config()
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)
 
 
 def test_ids_of_landmarks_anywhere_are_named() -> None:

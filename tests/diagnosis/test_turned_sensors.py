@@ -36,7 +36,7 @@ def test_a_sensor_that_is_turned_by_ten_degrees_on_the_way_is_named_first() -> N
         for e in log.events
     ]
     log = replace(log, events=events)
-    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config))
+    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)
     (cause, *others) = km.diagnose(run).causes
     assert (cause.name, cause.since_s) == ("mount", pytest.approx(10.0, abs=0.5))
     assert cause.evidence.startswith(f"from t={cause.since_s:.1f} s on the sensor rover.lidar is turned by ")
@@ -57,7 +57,7 @@ def test_a_sensor_that_is_turned_by_ten_degrees_on_the_way_is_named_first() -> N
 def test_the_turn_of_a_mount_matches_differences(name: str, options: tuple[str, ...]) -> None:
     world = load_world(name, options)
     log = simulate(world, 3)
-    given = batch_input(km.record(build_slam(world.config(), log), log, progress=False))
+    given = batch_input(km.record(build_slam(world.config(), log), log, progress=False, pictures=False))
     problem, h = replay_events(given, log), 1e-6
     linear = Linear.of(problem, problem.start)
     f, factor = next((f, o) for f, o in enumerate(problem.factors) if o.term.blocks[-1].group == LANDMARKS)

@@ -25,7 +25,8 @@ def verdict_on(change: Change | None = None, sigma_m: float = 0.02) -> Verdict:
     log = simulate(load_world("hall_of_walls", (*WORLD, SENSORS.format(0.02))), 1)
     config = load_world("hall_of_walls", (*WORLD, SENSORS.format(sigma_m))).config()
     log = log if change is None else replace(log, events=[*map(change, log.events)])
-    return km.diagnose(km.record(build_slam(config, log), log, progress=False, config=config_dict(config)))
+    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)
+    return km.diagnose(run)
 
 
 def measuring(column: int, by: float, from_s: float = 0.0) -> Change:

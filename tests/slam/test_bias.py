@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.cli.run import run_log
-from kalmark.config import build_slam
+from kalmark.config import build_slam, load_config, open_config_log
 from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.results.record import record
 from kalmark.simulate import load_world
@@ -244,7 +243,9 @@ def test_bearings_tell_a_robot_that_stands_from_one_that_its_odometry_lets_creep
 
 def test_lost_in_the_woods_by_bearings_alone_keeps_its_scale(data: Callable[[str], Path]) -> None:
     data("lost_in_the_woods")
-    summary = run_log("lost_in_the_woods_bearing", progress=False).evaluate()
+    config = load_config("lost_in_the_woods_bearing")
+    log = open_config_log(config)
+    summary = record(build_slam(config, log), log, progress=False, pictures=False).evaluate()
     assert summary["robots"]["robot"]["ate_m"] < 0.132, "twice the error with ranges"
     assert summary["landmarks"] == 17
     assert summary["mounts"]["robot.laser"]["theta_rad"] == pytest.approx(0.082, abs=0.002), "as with ranges"

@@ -53,6 +53,15 @@ class Fits(NamedTuple):
     inverse: Array
     R: Array
 
+    def of(self, j: int) -> Fits:
+        """Return that of one position."""
+        return Fits(*(each[j] for each in self))
+
+    @property
+    def information(self) -> Array:
+        """The information matrix (2, 2) of one position."""
+        return self.H.T @ self.inverse @ self.H
+
 
 class RangeProblem(NamedTuple):
     """Fit of positions (J, 2) to ranges from the sensor's places (n, 2), and the blocks that those depend on.
@@ -115,20 +124,22 @@ class Trilateration:
         heading = scan.pose()[2]  # whatever it is, it rotates with the world frame
         angles = heading + 2 * np.pi * np.arange(self.directions) / self.directions
         starts = problem.places[nearest] + distances[nearest] * np.column_stack([np.cos(angles), np.sin(angles)])
-        minima = _search(problem.fit, starts)
-        least = int(np.argmin(minima.cost))
-        best = Fits(*(each[least] for each in minima))
-        if best.chi2 > chi2_gate(OUTLIER, max(1, len(kept) - 2)):
+        bent = problem.own > 0 or any(_varies(scan, each) for each in kept)
+        now, damping = problem.fit(starts), np.full(len(starts), 1e-3)
+        most = chi2_gate(OUTLIER, max(1, len(kept) - 2))
+        for all_ in (False, True):  # where the likeliest minimum does not determine it, the others are not sought
+            now, damping = _search(problem.fit, now, damping, all_)
+            best = now.of(int(np.argmin(now.cost)))
+            if best.chi2 <= most and not _is_determined(problem, best, bent):
+                return Step("deferred", f"{len(kept)} ranges do not determine yet where it is")
+        if best.chi2 > most:
             worst = int(np.argmax((best.inverse @ best.z) ** 2 / np.diag(best.inverse)))
             why = f"a range of {kept[worst].y[0]:.2f} m does not fit the others and is left out"
             return Step("deferred", why, replace(pending, measurements=(*kept[:worst], *kept[worst + 1 :])))
-        information = best.H.T @ best.inverse @ best.H
-        bent = problem.own > 0 or any(_varies(scan, each) for each in kept)
-        if not (_flat(best, problem) and _gaussian(problem.fit, best, information, bent)):
-            return Step("deferred", f"{len(kept)} ranges do not determine yet where it is")
-        gaps = minima.l - best.l
+        information = best.information
+        gaps = now.l - best.l
         apart = np.einsum("ji,ik,jk->j", gaps, information, gaps) > 1.0
-        if (apart & (minima.cost - best.cost < -2 * math.log(self.odds))).any():
+        if (apart & (now.cost - best.cost < -2 * math.log(self.odds))).any():
             return Step("deferred", f"{len(kept)} ranges fit two positions")
         W = np.linalg.solve(information, best.H.T @ best.inverse)
         parts = tuple((slot, len(scan.map.rows(slot))) for slot in problem.slots)
@@ -188,9 +199,11 @@ def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> RangeProblem:
     return RangeProblem(slots, S_x, S, fit, places)
 
 
-def _search(fit: Callable[[Array], Fits], starts: Array) -> Fits:
-    """Return the minima (J, 2) that positions come to by Levenberg's and Marquardt's steps."""
-    now, damping = fit(starts), np.full(len(starts), 1e-3)
+def _search(fit: Callable[[Array], Fits], now: Fits, damping: Array, all_: bool) -> tuple[Fits, Array]:
+    """Return positions (J, 2) after Levenberg's and Marquardt's steps, and the damping (J,) of these.
+
+    The search is over when all of them have settled in a minimum, or the likeliest one.
+    """
     for _ in range(STEPS):
         J = now.H.transpose(0, 2, 1) @ now.inverse
         A = J @ now.H
@@ -201,9 +214,15 @@ def _search(fit: Callable[[Array], Fits], starts: Array) -> Fits:
         better = np.einsum("ji,jik,jk->j", new.z, now.inverse, new.z) < now.chi2  # Sigma as it was
         damping = np.where(better, 0.1 * damping, 10 * damping)
         now = Fits(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(new, now, strict=True)))
-        if (np.abs(step).max(axis=1) < SETTLED).all():
+        settled = np.abs(step).max(axis=1) < SETTLED
+        if settled.all() or (not all_ and settled[np.argmin(now.cost)]):
             break
-    return now
+    return now, damping
+
+
+def _is_determined(problem: RangeProblem, best: Fits, bent: bool) -> bool:
+    """Return whether the likelihood about a minimum is that of a Gaussian."""
+    return _flat(best, problem) and _gaussian(problem.fit, best, best.information, bent)
 
 
 def _flat(best: Fits, problem: RangeProblem) -> bool:
