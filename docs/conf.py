@@ -77,6 +77,7 @@ html_static_path = ["site/static"]
 html_css_files = ["kalmark.css"]
 html_show_sourcelink = False
 html_copy_source = False
+html_search_scorer = "site/search.js"
 html_sidebars = {"index": []}
 html_theme_options = {
     "logo": {"text": "kalmark"},
@@ -95,3 +96,18 @@ html_theme_options = {
 }
 copybutton_prompt_text = r">>> |\.\.\. |\$ "
 copybutton_prompt_is_regexp = True
+
+
+def remove_old_pages(app, failure):
+    """Remove pages of an earlier build that are none any more, as of a lesson with a new name."""
+    if app.builder.format == "html" and failure is None:
+        found = app.env.found_docs | {"genindex", "search", "py-modindex"}
+        kept = {Path(app.builder.get_outfilename(page)) for page in found}
+        for page in Path(app.outdir).rglob("*.html"):
+            if page not in kept and not page.relative_to(app.outdir).parts[0].startswith("_"):
+                page.unlink()
+
+
+def setup(app):
+    """Connect what follows a build."""
+    app.connect("build-finished", remove_old_pages)

@@ -37,6 +37,15 @@ def test_a_name_of_the_table_exists(name: str) -> None:
     assert found(name) is not None
 
 
+def test_the_page_of_figures_shows_the_numbered_ones_and_each_lesson_of_the_slides() -> None:
+    shown = {seed: course_pages.drawn_items(ITEMS, seed) for seed in course_pages.SEEDS}
+    assert [title for title, _ in shown["T"]] == ["Figure 1", "Figure 2", "Figure 3", "Figure 4"]
+    slides = [each.page for _, each in shown["F"]]
+    assert slides == [f"slides/{path.stem}" for path in LESSONS if path.parent.name == "slides"]
+    titles = course_pages.pictures(ITEMS, DOCS / "lessons")
+    assert titles.count("{grid-item-card}") == sum(map(len, shown.values()))
+
+
 def test_commands_and_names_of_the_table_are_those_of_kalmark() -> None:
     verbs = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
     assert {command.split()[1] for command in COMMANDS} <= verbs

@@ -14,7 +14,7 @@ import api_pages
 
 SEEDS = {"S": "The guide [S]", "T": "The exercises [T]", "F": "The slides [F]", "TB": "The toolbox [TB]"}
 STATES = ("works", "partly", "missing")
-PICTURES = {"S": range(1, 10), "T": range(1, 5), "TB": (1, 2, 14, 16)}  # the toolbox's others are listings
+PICTURES = {"S": range(1, 10), "T": range(1, 5), "F": (), "TB": (1, 2, 14, 16)}  # the toolbox's others are listings
 SEARCH = """
 ```{raw} html
 <p><input id="items-search" type="search" placeholder="Search: an equation, a word, missing, ..." size="40"
@@ -129,24 +129,40 @@ def table(all_items: list[Item], pages: dict[str, str]) -> str:
 
 
 def pictures(all_items: list[Item], lessons: Path) -> str:
-    """Return the page of the figures that lessons draw again: the last picture of each lesson, which is complete."""
+    """Return the page of the figures that lessons draw again.
+
+    A lesson of several figures draws one each; of others it is the last picture, which is complete.
+    """
     out = [
         "# Figures of the four documents\n",
-        "Each figure by its number, as a lesson of the course draws it from what it computes.\n",
+        "Each figure by its number, as a lesson draws it from what it computes; slides have no numbers.\n",
     ]
-    for seed, numbers in PICTURES.items():
+    for seed in PICTURES:
         out += [f"## {SEEDS[seed]}\n", "::::{grid} 1 2 2 3\n:gutter: 3\n"]
-        for number in numbers:
-            for each in all_items:
-                if each.seed == seed and number in each.numbers["Figure"] and "/plot_" in each.page:
-                    folder, name = each.page.split("/")
-                    drawn = [path.name for path in (lessons / folder / "images").glob(f"sphx_glr_{name}_00?.png")]
-                    picture = max(drawn, default=f"sphx_glr_{name}_001.png")
-                    out.append(f":::{{grid-item-card}} Figure {number}\n:link: {each.page}\n:link-type: doc")
-                    out.append(f":img-bottom: {folder}/images/{picture}\n\n{each.item}\n:::\n")
-                    break
+        shown = drawn_items(all_items, seed)
+        for title, each in shown:
+            folder, name = each.page.split("/")
+            drawn = sorted(path.name for path in (lessons / folder / "images").glob(f"sphx_glr_{name}_00?.png"))
+            alike = [other for _, other in shown if other.page == each.page]
+            picture = (
+                drawn[alike.index(each) if len(alike) == len(drawn) else -1] if drawn else f"sphx_glr_{name}_001.png"
+            )
+            out.append(f":::{{grid-item-card}} {title}\n:link: {each.page}\n:link-type: doc")
+            out.append(f":img-bottom: {folder}/images/{picture}\n\n{each.item}\n:::\n")
         out.append("::::\n")
     return "\n".join(out)
+
+
+def drawn_items(all_items: list[Item], seed: str) -> list[tuple[str, Item]]:
+    """Return titles and items that lessons draw of a seed: figures by their numbers, of the slides one each lesson."""
+    mine = [each for each in all_items if each.seed == seed and "/plot_" in each.page]
+    if not PICTURES[seed]:
+        lessons = {each.page: each for each in reversed(mine) if each.page.startswith("slides/")}
+        return [(lessons[page].place, lessons[page]) for page in sorted(lessons)]
+    return [
+        (f"Figure {number}", next(each for each in mine if number in each.numbers["Figure"]))
+        for number in PICTURES[seed]
+    ]
 
 
 def target(page: str) -> str:

@@ -12,7 +12,7 @@ import kalmark as km
 from kalmark.errors import LogError
 from kalmark.events import Scan
 from kalmark.logs import open_log
-from kalmark.logs.source import records_of
+from kalmark.logs.source import records_of, spelling_hint
 from native_logs import GOOD, HEAD, SCANS, native
 
 BAD_ROWS = {
@@ -96,6 +96,9 @@ WITHOUT_UNIT = {
     ("scans", "robot", "Robot"): "robot",
     ("controls", "v_mps", "v"): "v_mps, in m/s",
     ("controls", "w_radps", "w_rpm"): "w_radps, in rad/s",
+    ("controls", "w_radps", "w_deg_s"): "w_radps, in rad/s; did you mean 'w_degps'?",
+    ("controls", "v_mps", "v_km_h"): "v_mps, in m/s; did you mean 'v_kmh'?",
+    ("controls", "v_mps", "v_m_s"): "v_mps, in m/s",
     ("truth", "x_m", "x"): "x_m, in metres",
     ("truth", "theta_rad", "theta_degree"): "theta_rad, in radians",
     ("landmarks", "y_m", "y"): "y_m, in metres",
@@ -116,6 +119,15 @@ def test_a_column_in_another_unit_or_in_none_is_refused_with_the_one_expected(
     assert str(refused.value) == (
         f"{path}:1: column {given!r} is unknown, expected {WITHOUT_UNIT[file, column, given]}"
     )
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    {"time_ms": "t_ms", "timestamp_ns": "t_ns", "velocity_mps": "v_mps", "vel_km_h": "v_kmh", "robto": "robot"}.items(),
+)
+def test_a_hint_at_a_column_has_the_unit_of_the_word(word: str, meant: str) -> None:
+    assert spelling_hint(word, ("t_s", "robot", "v_mps", "w_radps")) == f"; did you mean {meant!r}?"
+    assert spelling_hint("omega_degps", ("t_s", "v_mps")) == ""
 
 
 def test_columns_of_ones_own_sensor_are_read_whatever_they_are_called(tmp_path: Path) -> None:

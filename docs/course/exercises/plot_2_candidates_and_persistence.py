@@ -21,18 +21,14 @@ import numpy as np
 import kalmark as km
 
 rng, sigma, landmarks = np.random.default_rng(1), 0.02, np.array([[4.0, 3.0], [7.0, 4.0]])
-poses = [np.array([1.5 * k, 0.0, 0.0]) for k in range(4)]
-exact = [km.geometry.observe(r, landmarks)[0][:, 1] for r in poses]
+poses, candidates, found = np.outer(range(4), [1.5, 0.0, 0.0]), [], []
 ray_cov = np.diag([0.03, 0.03, np.hypot(0.01, sigma)]) ** 2  # pose and bearing, compounded
-bearings = exact + sigma * rng.normal(size=(4, 2))
+bearings = [km.geometry.observe(r, landmarks)[0][:, 1] + sigma * rng.normal(size=2) for r in poses]
 rays = [[np.array([*r[:2], b]) for b in bs] for r, bs in zip(poses, bearings, strict=True)]
-candidates, found = [], []
-for before, now in pairwise(rays):
-    for a, b in product(before, now):
-        p, P_a, P_b = km.geometry.intersection(a, b)
-        C = P_a @ ray_cov @ P_a.T + P_b @ ray_cov @ P_b.T
-        if np.isfinite(p).all():  # the rays meet
-            found.append((p, C))
+for a, b in [pair for before, now in pairwise(rays) for pair in product(before, now)]:
+    p, P_a, P_b = km.geometry.intersection(a, b)
+    C = P_a @ ray_cov @ P_a.T + P_b @ ray_cov @ P_b.T
+    found += [(p, C)] if np.isfinite(p).all() else []  # if the rays meet
 for p, C in found:
     near = [c for c in candidates if km.geometry.bhattacharyya(c[0], c[1], p, C) < 1.0]
     if near:
@@ -41,17 +37,38 @@ for p, C in found:
         candidates.append([p, C, 1])
 
 # %%
-# All intersections, and the candidates
-# -------------------------------------
+# Intersections of the bearings of two poses
+# ------------------------------------------
 #
-# Left: every intersection. Right: after merging; the number is the persistence. Ellipses are of 2 sigma.
-figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained", sharey=True)
-for ax, some in zip(axes, (found, candidates), strict=True):
+# Figure 2: the candidates after two poses, where three of the four pairs of bearings meet. One pair is of the same
+# landmark. Ellipses are of 2 sigma.
+
+
+def draw(some):
+    ax = plt.figure(layout="constrained").add_subplot(aspect="equal", xlim=(-1, 12), ylim=(-1, 8))
     for p, C, *persistence in some:
-        ax.plot(*km.geometry.ellipse(p, C, 2, 40).T, "tab:red", lw=1)
+        ax.plot(*km.geometry.ellipse(p, C, 2, 40).T, color="tab:blue" if persistence else "tab:red", lw=1)
         ax.text(*(p - [0, 0.7]), *map(str, persistence or [""]))
-    ax.plot(*landmarks.T, "k+", *np.array(poses)[:, :2].T, "b^", ms=10)
-    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=(-1, 12), ylim=(-1, 8))
+    ax.plot(*landmarks.T, "k+", *poses[:, :2].T, "b^", ms=10)
+    ax.set(xlabel="x [m]", ylabel="y [m]")
+
+
+draw(found[:3])
+
+# %%
+# Two estimates are merged
+# ------------------------
+#
+# Figure 3: candidates near to each other (red), and the merged one (blue) with its persistence.
+best = max(candidates, key=lambda c: c[2])
+draw([*(f for f in found if km.geometry.bhattacharyya(*best[:2], *f) < 1.0), best])
+
+# %%
+# Persistence
+# -----------
+#
+# Figure 4: all candidates after four poses, with their persistence.
+draw(candidates)
 plt.show()
 
 # %%

@@ -28,12 +28,18 @@ seen = slam.expect("robot", "camera", in_view=True)
 # ------
 #
 # Measurements are crosses. Blue are the predicted places of the mapped landmarks, after the correction, with their
-# ellipses of 3 sigma, made four times as large to be seen.
+# ellipses of 3 sigma, made four times as large to be seen; names are beside them.
 figure, image = plt.subplots(figsize=(7, 5.2), layout="constrained")
 image.plot(*log.events[-1].y.T, "k+")
-for name, e, Z in zip(seen.names, seen.e, seen.Z, strict=True):
+seen_by_height = sorted(zip(seen.e.tolist(), seen.names, seen.Z, strict=True), key=lambda each: each[0][1])
+for k, (e, name, Z) in enumerate(seen_by_height):
     image.plot(*km.geometry.ellipse(e, Z, sigmas=12, points=30).T, "C0", lw=1)
-    image.annotate(name, e + 6, color="C0", size="small")
+    place = {
+        "xytext": (14 + 12 * (k % 3), -3),
+        "textcoords": "offset points",
+        "arrowprops": {"arrowstyle": "-", "lw": 0.4},
+    }
+    image.annotate(name, e, color="C0", size="small", **place)
 image.set(xlim=(0, 640), ylim=(480, 0), aspect="equal", xlabel="u [px]", ylabel="v [px]")
 
 # %%

@@ -22,6 +22,7 @@ from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, short_text, 
 from kalmark.files import refuse_aliases
 from kalmark.geometry import rotations
 from kalmark.logs.log import Log
+from kalmark.logs.table_columns import in_unit_of
 
 Refuse = Callable[[str], None]
 """Takes one line about a bad row: raises it as a LogError, or notes it and lets reading go on (`on_error`)."""
@@ -139,8 +140,9 @@ def folder_of(path: Path, names: Iterable[str]) -> Path | None:
 
 
 def spelling_hint(word: str, words: Iterable[str]) -> str:
-    """Return a hint at the word that was probably meant, or nothing."""
-    close = get_close_matches(word, list(words), n=1)
+    """Return a hint at the word that was probably meant, a column in the unit of the word, or nothing."""
+    words = list(words)
+    close = [column for each in words if (column := in_unit_of(word, each))] or get_close_matches(word, words, n=1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

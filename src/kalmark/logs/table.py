@@ -34,14 +34,15 @@ from kalmark.logs.table_columns import (
     GLOBE,
     NAMES,
     NOT_NEGATIVE,
-    OTHER_UNITS,
     POSE3,
+    TIMES,
     UNITS,
     WHEELS,
+    in_unit_of,
+    split_unit,
 )
 
 T = TypeVar("T")
-TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
 CSV, PARQUET = ".csv", ".parquet"
 ONE_IN_A_FILE = "expected one of them in a file: scans.csv and measurements.csv may have one each"
 NEAR_PI = 0.99  # of pi: directions all around that are within pi come nearer to it
@@ -248,10 +249,9 @@ def read_table(
         refuse_unit(where, name, known)
     for name in required:
         if name not in header:
-            odd = get_close_matches(name, [other for other in header if other not in known], n=1)
-            what, hint = (
-                (f"column {odd[0]!r} is unknown", f"; did you mean {name!r}?") if odd else (f"no column {name}", "")
-            )
+            hints = {other: hint for other in header if other not in known and (hint := spelling_hint(other, [name]))}
+            odd, hint = next(iter(hints.items()), ("", ""))
+            what = f"column {odd!r} is unknown" if odd else f"no column {name}"
             raise LogError(f"{where}: {what}, expected {', '.join(required)}{hint}")
     for name in header:
         if header.count(name) > 1 or not name:
@@ -308,13 +308,15 @@ def header_in_units(header: list[str], known: tuple[str, ...]) -> tuple[list[str
 def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
     """Refuse a column that is one of `known` but for its unit: without it, in another one, or otherwise written."""
     plain = "_".join(re.findall("[a-z0-9]+", name.lower()))
-    stem, _, unit = plain.rpartition("_")
-    stem = stem if unit in OTHER_UNITS or unit in UNITS else plain
+    stem, _ = split_unit(name)
     meant = [each for each in known if stem == each.rpartition("_")[0] or plain == each]
     if stem and name not in known and meant:
         closest = next(iter(get_close_matches(plain, meant, n=1, cutoff=0.0)))
         measure = UNITS.get(closest.rpartition("_")[2])
-        raise LogError(f"{where}: column {name!r} is unknown, expected {closest}{f', in {measure}' if measure else ''}")
+        other = in_unit_of(name, closest)
+        hint = f"; did you mean {other!r}?" if other not in ("", name, closest) else ""
+        wanted = f"{closest}{f', in {measure}' if measure else ''}{hint}"
+        raise LogError(f"{where}: column {name!r} is unknown, expected {wanted}")
 
 
 def decimal_point(text: str) -> str:

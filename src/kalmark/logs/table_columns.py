@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 POSITION = ("x_m", "y_m", "z_m")
 POSE2, POSE3 = (*POSITION[:2], "theta_rad"), (*POSITION, "qx", "qy", "qz", "qw")
@@ -51,7 +52,29 @@ FACTORS = {
     "dps": ("radps", math.pi / 180), "g": ("mps2", 9.80665), "mg": ("mps2", 9.80665e-3),
 }  # fmt: skip
 """Units of columns that are taken, too: each the unit that it becomes, and by what it is multiplied."""
+TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
+"""The columns of times, and how many nanoseconds are one of each."""
+BASES = {unit: unit for unit in UNITS} | {unit: base for unit, (base, _) in FACTORS.items()}
+BASES |= {name.removeprefix("t_"): "s" for name in TIMES}
+"""The unit that each unit that is taken becomes."""
 DIRECTIONS = ("bearing_rad", "azimuth_rad", "elevation_rad", "normal_rad")
 """The columns of directions, which are within a turn."""
 GLOBE = {"lat_deg": "x_m", "lon_deg": "y_m", "height_m": "z_m"}
 """Columns of positions on the globe, and those of the tangent plane whose place in a row they take."""
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return the stem and the unit of a column's name, "" without one: of w_deg_s, as of w_degps, w and degps."""
+    *stem, last = re.findall("[a-z0-9]+", name.lower()) or [""]
+    units = [(f"{stem[-1]}p{last}", 1), (stem[-1] + last, 1), (last, 0)] if stem else []
+    for unit, more in units:
+        if unit in BASES or unit in OTHER_UNITS:
+            return "_".join(stem[: len(stem) - more]), unit
+    return "_".join([*stem, last]), ""
+
+
+def in_unit_of(name: str, column: str) -> str:
+    """Return a column in the unit of a name of the same quantity that begins alike, or "": t_ms of time_ms and t_s."""
+    (stem, unit), (known, base) = split_unit(name), split_unit(column)
+    alike = bool(stem and known) and (stem.startswith(known) or known.startswith(stem))
+    return f"{known}_{unit}" if alike and base and BASES.get(unit) == BASES.get(base) else ""

@@ -97,6 +97,8 @@ def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any
     true, landmarks = truth_until_now(slam, truth, size)
     shown = [*(way[:, :d] for way in (*ways.values(), *true.values())), *places_of(landmarks, d), known]
     ends = {name: (pose, P) for (name, pose), P in zip(poses.items(), robots, strict=True)}
+    rays = tuple(ray for report in reports for ray in rays_of(slam, report)) if picture.sensors else ()
+    shown += [np.array([ray.seen_at for ray in rays]).reshape(-1, d)]
     low, high = drawn_box(np.empty((0, d)), ends, drawn, shown, picture)
     most = max(map(len, (*ways.values(), *true.values())))
     return Scene(
@@ -121,7 +123,7 @@ def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any
         known_ids=tuple(exact.ids),
         world=world,
         aligned=False,
-        rays=tuple(ray for report in reports for ray in rays_of(slam, report)),
+        rays=rays,
         picture=picture,
         end="robot",
     )
