@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +14,13 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
+from PIL import Image
 
 import kalmark as km
 from kalmark.logs.log import Log, Trajectory
 from kalmark.report import Report
+from kalmark.results.filter_description import KEPT, correlations_kept
+from kalmark.results.history import WHOLE
 from kalmark.results.plot import draw_map, save_map
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
@@ -299,3 +304,20 @@ def test_pictures_of_sensors_have_width_colours_and_format_of_the_section(tmp_pa
     assert "#000000" in expected
     with pytest.raises(km.KalmarkError, match=r"map.bmp: the ending is '.bmp', expected a format of matplotlib"):
         save_map(other, tmp_path / "map.bmp")
+
+
+def test_a_map_that_is_kept_has_the_correlations_of_its_numbers_unless_it_is_large(tmp_path: Path) -> None:
+    log = circle(steps=12, landmarks=5)
+    slam = slam_for(log)
+    run = record(slam, log, progress=False)
+    last = run.history.maps[-1]
+    P = slam.covariance(*slam.robots, *last.ids)
+    sigma = np.sqrt(np.diagonal(P))
+    assert np.abs(last.correlations / WHOLE - P / np.outer(sigma, sigma)).max() <= 0.5 / WHOLE
+    again = Run.load(run.save(tmp_path / "run")).history.maps
+    assert all(np.array_equal(a.correlations, b.correlations) for a, b in zip(again, run.history.maps, strict=True))
+    picture = Image.open(io.BytesIO(base64.b64decode(series(run, Scene.of(run))["maps"][-1]["P"].partition(",")[2])))
+    assert picture.size == P.shape
+    red, _, blue = picture.convert("RGB").getpixel((0, 0))  # type: ignore[misc]
+    assert red > 2 * blue, "a correlation of 1 is red"
+    assert correlations_kept(slam, [*last.ids] * (KEPT + 1)).size == 0

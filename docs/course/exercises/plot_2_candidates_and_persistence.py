@@ -61,7 +61,7 @@ draw(found[:3])
 #
 # Figure 3: candidates near to each other (red), and the merged one (blue) with its persistence.
 best = max(candidates, key=lambda c: c[2])
-draw([*(f for f in found if km.geometry.bhattacharyya(*best[:2], *f) < 1.0), best])
+draw([*((p, C) for p, C in found if km.geometry.bhattacharyya(best[0], best[1], p, C) < 1.0), best])
 
 # %%
 # Persistence

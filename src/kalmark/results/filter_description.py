@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -9,15 +10,15 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import plugin_of
 from kalmark.errors import MapError
-from kalmark.events import Scan
+from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
 from kalmark.logs.log import Log
 from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth, parameter_names, self_calibrating
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
-from kalmark.results.history import Biased, CalibratedMount, Camera, Measuring
-from kalmark.results.landmark_table import LINE
+from kalmark.results.history import NONE, WHOLE, Biased, CalibratedMount, Camera, Measuring
+from kalmark.results.landmark_table import LINE, TINY
 from kalmark.results.truth import as_rigid
 from kalmark.slam.description import describe
 from kalmark.slam.held_control import bias_name
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has no focal length
 USED = ("associated", "new")
+KEPT = 40  # landmarks of a map whose correlations are kept
 
 
 def configuration(slam: Slam, log: Log, known: str | None = None) -> dict[str, Any]:
@@ -186,3 +188,12 @@ def residual_px(slam: Slam, scan: Scan, report: Report) -> Array:
     rms = np.sqrt(0.25 * np.sum((y[:, :8] - e) ** 2, axis=1))
     left[rows] = np.nan_to_num(rms, nan=np.inf)  # behind the camera
     return left
+
+
+def correlations_kept(slam: Slam, ids: Sequence[Id]) -> Any:
+    """Return the correlations (n, n) of robots and landmarks as parts of `WHOLE`, `NONE` of a large map."""
+    if len(ids) > KEPT:
+        return NONE
+    P = slam.covariance(*slam.robots, *ids)
+    sigma = np.sqrt(np.maximum(np.diagonal(P), TINY))
+    return np.clip(np.round(WHOLE * P / np.outer(sigma, sigma)), -WHOLE, WHOLE).astype(np.int8)

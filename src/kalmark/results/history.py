@@ -141,13 +141,18 @@ class Prior(NamedTuple):
     covariance: Matrix
 
 
+WHOLE = 16  # a correlation of 1 in a map that is kept
+NONE: Any = np.zeros((0, 0), dtype=np.int8)
+
+
 class MapSnapshot(NamedTuple):
     """The landmarks of the map after step `step`: ids, places (K, n) and their covariances (K, q, q), kinds.
 
     In the plane places are positions.  In space they are positions, endpoints of lines or poses of tags, padded with
     NaN (see `kalmark.results.landmark_table`).  `shape` (K, q, q) are the
     covariances without the motion of the world in common (`kalmark.results.gauge`), `robots` (R, d, d) those of the
-    robots' positions, in the order of their starts.
+    robots' positions, in the order of their starts.  `correlations` (n, n) are those of all numbers of robots and
+    landmarks, as parts of `WHOLE`; (0, 0) of a large map.
 
     >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
     >>> scan = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8])
@@ -166,6 +171,7 @@ class MapSnapshot(NamedTuple):
     kinds: tuple[str, ...]
     shape: Array
     robots: Array
+    correlations: Array = NONE
 
 
 class Camera(NamedTuple):
@@ -458,6 +464,8 @@ class History:
             "map_kind": texts([kind for m in self.maps for kind in m.kinds]),
             "map_mean": padded_all([mean for m in self.maps for mean in m.means]),
             "map_covariance": pad_blocks(blocks, [len(block) for block in blocks], width, matrices=True),
+            "map_order": np.array([len(m.correlations) for m in self.maps], dtype=np.int64),
+            "map_correlation": np.concatenate([NONE.ravel(), *(m.correlations.ravel() for m in self.maps)]),
         }
         named["stepped"] = np.array(self.stepped, dtype=np.str_)
         named["control_robot"] = texts(list(self.controls))
@@ -473,15 +481,16 @@ class History:
         given |= {name: rows_of_arrays(prefix, kind, named, joined) for name, (prefix, kind, joined) in ROWS.items()}
         ends, keys = np.cumsum(named["map_size"])[:-1], ("mean", "covariance", "landmark", "kind", "shape")
         parts = zip(*(np.split(named[f"map_{key}"], ends) for key in keys), strict=True)
-        times = zip(
-            named["map_step"].tolist(), named["map_t_ns"].tolist(), parts, named["map_robot"], strict=False
-        )  # no map: one empty part
+        orders = named["map_order"]
+        flat = np.split(named["map_correlation"], np.cumsum(orders**2)[:-1])
+        correlations = [part.reshape(n, n) for part, n in zip(flat, orders.tolist(), strict=False)]
+        kept = named["map_step"].tolist(), named["map_t_ns"].tolist(), parts, named["map_robot"], correlations
         given["maps"] = tuple(
             MapSnapshot(
-                step, t_ns, tuple(map(as_id, names.tolist())), means, covariances, tuple(kinds.tolist()), shape, robots
+                step, t_ns, tuple(map(as_id, names.tolist())), means, covariances, tuple(kinds.tolist()), shape, *more
             )
-            for step, t_ns, (means, covariances, names, kinds, shape), robots in times
-        )
+            for step, t_ns, (means, covariances, names, kinds, shape), *more in zip(*kept, strict=False)
+        )  # no map: one empty part
         spans = zip(named["control_robot"].tolist(), named["control_span"].tolist(), strict=True)
         given["stepped"] = str(named["stepped"])
         return cls(**given, controls={robot: Controlled(*span) for robot, span in spans})

@@ -24,6 +24,7 @@ from kalmark.results.filter_description import (
     calibrated_mounts,
     cameras,
     configuration,
+    correlations_kept,
     residual_px,
     sensors,
     stated_noise,
@@ -255,7 +256,8 @@ class _Recorder:
         landmarks, (shape, robots) = whole.split()[0], whole.shape(self.slam, [start.robot for start in self.starts])
         of_shape, kinds = shape.split()[0].places()[1], tuple(landmarks.kinds)
         when = len(self.reports) - 1, self.reports[-1].t_ns, tuple(landmarks.ids)
-        return MapSnapshot(*when, *landmarks.places(), kinds, of_shape, robots)
+        correlations = correlations_kept(self.slam, when[-1])
+        return MapSnapshot(*when, *landmarks.places(), kinds, of_shape, robots, correlations)
 
     def run(self, config: Mapping[str, Any] | None, wall_s: float) -> Run:
         """Return the run made of what was gathered."""

@@ -5,7 +5,9 @@ Its pictures are drawn from data: the scene at each position of the slider, and 
 
 from __future__ import annotations
 
+import base64
 import html
+import io
 import json
 import math
 import re
@@ -16,7 +18,9 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.colors import to_hex
+from PIL import Image
 
 from kalmark.arrays import Array
 from kalmark.picture_options import Picture
@@ -35,7 +39,8 @@ from kalmark.results.figure_texts import (
     difference_rows,
     rows_with_labels,
 )
-from kalmark.results.history import Camera, History, Ints, LandmarkChange, MapSnapshot
+from kalmark.results.filter_description import KEPT
+from kalmark.results.history import WHOLE, Camera, History, Ints, LandmarkChange, MapSnapshot
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
 from kalmark.results.plot import BEHIND, Projection
 from kalmark.results.recording import Recording, config_yaml
@@ -204,6 +209,7 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
     return {
         "box": {"low": round_values(scene.low, 3), "high": round_values(scene.high, 3)},
         "picture": page_options(scene),
+        "correlationsOf": KEPT,
         "ellipses": scene.of_what,
         "how": scene.how,
         "maps": [_map(m, float(t[m.step]), scene) for m in maps],
@@ -250,7 +256,18 @@ def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
     lines = {"lines": xy(join_polylines(drawn.lines, scene.d))}
     head = {"t": round(t_s, 3), "id": [str(m.ids[row]) for row in drawn.row], "group": drawn.group.tolist()}
     tags = {"tags": xy(join_polylines(squares(drawn.tags, scene.size)))} if scene.d == 3 else {}
-    return {**head, "count": len(m.ids), **lines, **tags, **gaussians(drawn.means, drawn.covariances)}
+    P = {"P": correlation_image(m.correlations)} if m.correlations.size else {}
+    return {**head, "count": len(m.ids), **lines, **tags, **gaussians(drawn.means, drawn.covariances), **P}
+
+
+def correlation_image(correlations: Array) -> str:
+    """Return correlations (n, n), parts of `WHOLE`, as an image in a URI: blue -1, white 0, red 1."""
+    image, out = Image.fromarray((correlations + WHOLE).astype(np.uint8), mode="P"), io.BytesIO()
+    image.putpalette(
+        (255 * colormaps["RdBu_r"](np.linspace(0.0, 1.0, 2 * WHOLE + 1))[:, :3]).astype(np.uint8).tobytes()
+    )
+    image.save(out, "PNG")
+    return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode()
 
 
 def _camera(

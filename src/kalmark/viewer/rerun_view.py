@@ -20,6 +20,7 @@ from kalmark.report import Report
 from kalmark.results.camera_images import Pictures
 from kalmark.results.filter_description import mount_now, observed_points
 from kalmark.results.filter_picture import scene_of_filter, truth_to_map
+from kalmark.results.history import WHOLE
 from kalmark.results.measures import nees, nis, pose_error
 from kalmark.results.recording import Recording
 from kalmark.results.scene import Ray, Scene, images, images_of_report, map_shapes, picture_of, steps_of
@@ -123,6 +124,8 @@ def replay(run: Recording, save: Path | None = None) -> None:
             kept = maps[step]
             places = dict(zip(map(str, kept.ids), kept.means[:, : scene.d], strict=True))
             stream.landmarks(replace(scene, ids=kept.ids, shapes=map_shapes(kept, scene.d, True)))
+            if kept.correlations.size:
+                stream.correlations(kept.correlations / WHOLE)
         stream.scan(replace(scene, rays=tuple(_rays(run, slam, step, places))))
         for camera in (camera for camera, seen in of_cameras if step in seen):
             for image in images(history, camera, step):

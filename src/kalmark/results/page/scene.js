@@ -222,7 +222,17 @@ function mapPicture() {
     else if (shown) page.scene.camera = PICTURE.orbit && playing ? turned(shown.getCamera(), 3) : shown.getCamera();
     Plotly.react("map", [...background, ...moving(DATA.maps[kept], now)], page, CONFIG);
     if (!waiting.has(el("images"))) images();
+    drawCovariance(DATA.maps[kept]);
   };
+}
+
+/* The correlations of a map that was kept, of which large maps have none. */
+function drawCovariance(map) {
+  const words = document.querySelector("#covariance figcaption"), picture = new Image();
+  if (map.P) Object.assign(picture, {src: map.P, alt: "correlations of P"});
+  el("covariance").replaceChildren(...(map.P ? [picture] : []), words);
+  words.textContent = map.P ? `P at ${map.t.toFixed(2)} s: correlations of robots, then landmarks; blue -1, white 0, red 1` :
+    `P is not kept here: the map has more than ${DATA.correlationsOf} landmarks`;
 }
 
 /* The part of the straight line through two pixels that lies in the image, or nothing. */
