@@ -98,6 +98,15 @@ class NearestNeighbour(Gated):
     """The nearest landmark by Mahalanobis distance, inside its gate.
 
     Each is taken at most once in a scan, the closest pair first.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.NearestNeighbour())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     alone: ClassVar[bool] = True
@@ -126,6 +135,15 @@ class GlobalAssignment(Gated):
 
     An observation without a pair counts as the gate.  Bipartite matching: an observation gives way to another if that
     makes the whole better.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.GlobalAssignment())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     alone: ClassVar[bool] = True
@@ -141,6 +159,15 @@ class JointCompatibility(Gated):
 
     Neira and Tardos 2001.  The error of the pose is common to all observations of a scan, which only a joint test
     considers.  At most `most_nodes` of the search are examined; the best matching by then is taken.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.JointCompatibility())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     most_nodes: Annotated[Count, "Nodes of the search after which the best so far is taken."] = 20_000
@@ -173,6 +200,15 @@ class ByIdentity:
 
     `gate` is the probability with which a right pair is let through; "off" fuses all; "default" is the estimator's own:
     the guide's 3 sigma for `Ekf`, off for the others.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.ByIdentity())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]], ids=[7, 8]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     gate: Annotated[Gate, Within(gt=0, lt=1), "Refuse observations outside this probability; or off, or default."] = (

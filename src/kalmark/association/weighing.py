@@ -105,6 +105,15 @@ class Automatic(Weighing):
     the matchings whose pairs agree with each other is taken (`posterior`), and of it each pair that is at least as
     probable as `confidence`; the others are deferred.  A matching of a lost robot is only taken if it holds most of the
     scan, none as good is expected by chance, and none with a pair less is of another pose.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.Automatic())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     confidence: Annotated[
@@ -133,6 +142,15 @@ class Sampled(Weighing):
     [F]'s independent samples from the posterior.
 
     The same scan draws the same matching for the same `seed`.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.Sampled())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     seed: Annotated[int, Within(ge=0), "Another one draws others."] = 0
@@ -153,6 +171,15 @@ class Averaged(Weighing):
 
     The map becomes the mean of what it would be after each, and its covariance holds how far these are apart.  Needs a
     dense map.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.Averaged())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     averages: ClassVar[bool] = True
@@ -172,6 +199,15 @@ class Cliques(Gated):
 
     Two pairs agree if the landmarks are as far from each other as the observations are; the pose is not used before the
     joint test.  Where two sets as large contradict each other, both are deferred.  For the closing of loops.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1))
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar})
+    >>> slam = km.Slam(rover, association=km.association.Cliques())
+    >>> for name, place in {7: (4.0, 1.0), 8: (2.0, -1.0)}.items():
+    ...     slam.add_landmark(name, mean=place, cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24], [2.2, -0.46]]))
+    >>> [(o.outcome, o.landmark) for o in report.observations]
+    [('associated', 7), ('associated', 8)]
     """
 
     most_nodes: Annotated[Count, "Comparisons of pairs after which the search ends."] = 5_000_000

@@ -117,6 +117,12 @@ class PinHole(_Lens):
     """A camera that measures points: pixels u, v.
 
     [TB] pinHole.  `calibration` names a file of OpenCV, Kalibr, ROS or EuRoC instead: cameras.md.
+
+    >>> eye = km.Mount(km.sensors.PinHole(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> slam.add_landmark(7, mean=(4.0, 0.0, 0.0), cov=0.01 * np.eye(3))
+    >>> slam.expect("drone", "eye").e.round(1)
+    array([[320., 240.]])
     """
 
 

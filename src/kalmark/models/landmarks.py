@@ -47,7 +47,13 @@ class _Landmark:
 
 @register("landmark", "point")
 class Point2D(_Landmark):
-    """A Euclidean point (x, y) of the plane."""
+    """A Euclidean point (x, y) of the plane.
+
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle()))
+    >>> slam.add_landmark("tree", mean=(4.0, 1.0), cov=0.01 * np.eye(2))
+    >>> slam.mean("tree"), slam.landmark_model("tree").kind
+    (array([4., 1.]), 'point')
+    """
 
     kind: ClassVar[str] = "point"
     space: ClassVar[Space] = spaces.POINT2
@@ -217,6 +223,13 @@ class InverseDepth2D(_BecomesPoint):
 
     The nearest landmark at d m is in the prior if prior_rho_per_m + 2 sigma_rho_per_m is 1 / d.  [S] 2.3.6, (48).  The
     default prior is [S] (47), rho in [0, 1 / d_min] with d_min = 1 m, as a Gaussian with both ends at two sigmas.
+
+    >>> eye = km.Mount(km.sensors.Bearing(), landmark=km.landmarks.InverseDepth2D())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"eye": eye}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "eye", [[0.0]], ids=[7]))
+    >>> place, P = slam.place(7)
+    >>> place.round(1), np.sqrt(np.diag(P)).round(2)  # the depth is hardly known
+    (array([2., 0.]), array([1.  , 0.04]))
     """
 
     prior_rho_per_m: PriorDepth = 0.5

@@ -156,6 +156,9 @@ class Unicycle(SpeedAndTurn):
     """Speed and turn rate, each held until the next control.
 
     A control is u = (v m/s, w rad/s); the exact arc of [F] with both its limits.
+
+    >>> km.motion.Unicycle().move(np.zeros(3), np.array((1.0, 0.5)), 2.0)[0].round(3)
+    array([1.683, 0.919, 1.   ])
     """
 
     moves: ClassVar[Any] = unicycle
@@ -167,6 +170,9 @@ class Odometry2D(PlanarMotion):
 
     A control u (3,) is the motion that ended at its time.  [S] (57)-(60).  The sigmas are those of one increment.  A
     diffusion counts the time since the last increment, none for the first.
+
+    >>> km.motion.Odometry2D().move(np.zeros(3), np.array((1.0, 0.0, 0.1)), 0.1)[0].round(3)
+    array([1. , 0. , 0.1])
     """
 
     sigma_x_m: Annotated[NotNegative, "Error of one increment, forward."] = 0.01
@@ -199,6 +205,9 @@ class Ackermann(Steered):
     A control is u = (speed of the left rear wheel m/s, steering rad); the state is the rear axle's centre.
     `encoder_offset_m` is the wheel's distance to the left of the centre line, negative to the right; 0 for a speed that
     is the axle's own.
+
+    >>> km.motion.Ackermann().move(np.zeros(3), np.array((1.0, 0.2)), 1.0)[0].round(3)
+    array([1.057, 0.04 , 0.076])
     """
 
     wheelbase_m: Annotated[Positive, "Distance between the axles."] = 2.83
@@ -223,6 +232,10 @@ class Odometry3D(MotionModel):
     """Increments dx, dy, dz and a rotation vector rx, ry, rz, in the robot's frame.
 
     A control is u (6,), m and rad.  The sigmas are those of one increment.
+
+    >>> start = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    >>> km.motion.Odometry3D().move(start, np.array((1.0, 0.0, 0.0, 0.0, 0.0, 0.1)), 1.0)[0].round(3)
+    array([1.   , 0.   , 0.   , 0.   , 0.   , 0.05 , 0.999])
     """
 
     sigma_x_m: Annotated[NotNegative, "Error of one increment, forward."] = 0.01
@@ -253,6 +266,10 @@ class Velocity3D(MotionModel):
     """Velocity and turn rate in the robot's frame, each held until the next control.
 
     A control is u = (vx, vy, vz, wx, wy, wz), m/s and rad/s.
+
+    >>> start = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    >>> km.motion.Velocity3D().move(start, np.array((1.0, 0.0, 0.0, 0.0, 0.0, 0.1)), 1.0)[0].round(3)
+    array([0.998, 0.05 , 0.   , 0.   , 0.   , 0.05 , 0.999])
     """
 
     sigma_vx_mps: Annotated[NotNegative, "Error of the velocity held over its interval, forward."] = 0.1

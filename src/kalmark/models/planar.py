@@ -200,6 +200,12 @@ class RangeBearing(_RangingBearing):
     """Distance and direction of a landmark: a laser.
 
     sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61).
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(sigma_range_m=0.05), at=(0.2, 0.0, 0.0))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8]))
+    >>> slam.mean(7).round(3)
+    array([4.021, 1.182])
     """
 
     sigma_bearing_rad: BearingNoise = 0.02
@@ -215,7 +221,14 @@ class RangeBearing(_RangingBearing):
 
 @register("sensor", "bearing")
 class Bearing(_Planar):
-    """Direction of a landmark: a camera, a radio direction finder."""
+    """Direction of a landmark: a camera, a radio direction finder.
+
+    >>> eye = km.Mount(km.sensors.Bearing(sigma_bearing_rad=0.01))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"eye": eye}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "eye", [[0.5]], ids=[7]))
+    >>> slam.landmark_model(7).kind
+    'inverse_depth_2d'
+    """
 
     sigma_bearing_rad: BearingNoise = 0.02
 
@@ -252,7 +265,16 @@ class _Range(_Ranging, Cone, Distancing):
 
 @register("sensor", "range")
 class Range(_Range, Raised):
-    """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
+    """Distance to a landmark: a radio beacon, a sonar with a wide lobe.
+
+    >>> tag = km.Mount(km.sensors.Range(sigma_range_m=0.1))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"tag": tag}, cov=np.eye(3)))
+    >>> for name, place in {"a": (0.0, 5.0), "b": (5.0, 0.0), "c": (-4.0, -3.0)}.items():
+    ...     slam.add_landmark(name, place, cov=1e-6 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "tag", [[5.2], [5.0], [4.8]], ids=["a", "b", "c"]))
+    >>> slam.mean("rover")[:2].round(2), np.sqrt(np.diag(slam.covariance("rover")))[:2].round(2)
+    (array([-0.02, -0.26]), array([0.09, 0.13]))
+    """
 
     def distances(self, y: Array) -> Array:
         """Return the distances (K,) in the plane that ranges y (K, 1) of landmarks at height 0 stand for."""
@@ -272,6 +294,12 @@ class Position2D(_Planar):
     """Position of a landmark (x, y) in the sensor's frame.
 
     [F]'s second measurement model.
+
+    >>> camera = km.Mount(km.sensors.Position2D(), at=(0.0, 0.0, 1.5708))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"camera": camera}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "camera", [[2.0, 0.0]], ids=["post"]))
+    >>> slam.mean("post").round(3)  # to the left, as the sensor looks
+    array([-0.,  2.])
     """
 
     sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1

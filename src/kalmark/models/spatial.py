@@ -25,6 +25,12 @@ class Wall(Spatial):
 
     The ends of the segment, right and left, are abscissas from the foot of the perpendicular on.  Innovations and noise
     have two numbers: the ends are where the laser's view ends, not where the wall does.  docs/walls.md.
+
+    >>> lidar = km.Mount(km.sensors.Wall())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[3.0, 0.0, -1.0, 2.0]], ids=["w"]))
+    >>> slam.landmark_model("w").kind
+    'wall'
     """
 
     sigma_distance_m: Annotated[Positive, "Noise of the distance of the line."] = 0.02
@@ -66,7 +72,14 @@ class Wall(Spatial):
 
 @register("sensor", "range_bearing_3d")
 class RangeBearing3D(Cone, Spatial):
-    """Distance, azimuth and elevation of a landmark; x is forward, z up: a 3-D laser, a radar."""
+    """Distance, azimuth and elevation of a landmark; x is forward, z up: a 3-D laser, a radar.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"lidar": lidar}))
+    >>> report = slam.process(km.Scan(0.0, "drone", "lidar", [[5.0, 0.0, 0.6435]], ids=[7]))
+    >>> slam.mean(7).round(2)
+    array([4., 0., 3.])
+    """
 
     sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.1
     sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
@@ -87,7 +100,14 @@ class RangeBearing3D(Cone, Spatial):
 
 @register("sensor", "position_3d")
 class Position3D(Cone, Spatial):
-    """Position of a landmark (x, y, z) in the sensor's frame; x is forward, z up: an RGB-D camera, a lidar."""
+    """Position of a landmark (x, y, z) in the sensor's frame; x is forward, z up: an RGB-D camera, a lidar.
+
+    >>> camera = km.Mount(km.sensors.Position3D(), at=(0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"camera": camera}))
+    >>> report = slam.process(km.Scan(0.0, "drone", "camera", [[2.0, 1.0, 0.2]], ids=["post"]))
+    >>> slam.mean("post").round(3)
+    array([2. , 1. , 0.7])
+    """
 
     sigma_x_m: Annotated[Positive, "Noise, along x."] = 0.1
     sigma_y_m: Annotated[Positive, "Noise, along y."] = 0.1
@@ -107,6 +127,12 @@ class TagPose(Spatial):
     """The poses of square tags (x, y, z, qx, qy, qz, qw) in the sensor's frame.
 
     Innovations and noise have 6 numbers.
+
+    >>> camera = km.Mount(km.sensors.TagPose())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"camera": camera}))
+    >>> report = slam.process(km.Scan(0.0, "drone", "camera", [[2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]], ids=[7]))
+    >>> slam.mean(7).round(2), slam.landmark_model(7).kind
+    (array([2., 0., 0., 0., 0., 0., 1.]), 'tag')
     """
 
     sigma_position_m: Annotated[Positive, "Noise of each coordinate."] = 0.02

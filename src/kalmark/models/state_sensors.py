@@ -270,7 +270,14 @@ class StateSensor(Sensing):
 # ------------------------------------------------------------------ of the pose
 @register("sensor", "heading")
 class Heading(StateSensor):
-    """A compass: the heading of the sensor's x axis, from the map's x axis to the left, less the declination."""
+    """A compass: the heading of the sensor's x axis, from the map's x axis to the left, less the declination.
+
+    >>> own = km.Mount(km.sensors.Heading())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}, cov=np.eye(3)))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[0.3]]))
+    >>> slam.mean("rover").round(2)
+    array([0. , 0. , 0.3])
+    """
 
     sigma_heading_rad: Annotated[Positive, "Noise of the heading."] = 0.05
     _: KW_ONLY
@@ -305,7 +312,14 @@ class _Gps(StateSensor):
 
 @register("sensor", "gps")
 class Gps2D(_Gps):
-    """The position of an antenna, at its mount, in the map's frame: GPS, a total station, a beacon system."""
+    """The position of an antenna, at its mount, in the map's frame: GPS, a total station, a beacon system.
+
+    >>> own = km.Mount(km.sensors.Gps2D())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}, cov=np.eye(3)))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[2.0, 1.0]]))
+    >>> slam.mean("rover").round(2)
+    array([ 1. ,  0.5, -0. ])
+    """
 
     _: KW_ONLY
     bias_x_m: Bias = 0.0
@@ -321,7 +335,14 @@ class Gps2D(_Gps):
 
 @register("sensor", "gps")
 class Gps3D(_Gps):
-    """The position of an antenna, at its mount, in the map's frame."""
+    """The position of an antenna, at its mount, in the map's frame.
+
+    >>> own = km.Mount(km.sensors.Gps3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}, cov=np.eye(6)))
+    >>> report = slam.process(km.Scan(0.0, "drone", "own", [[2.0, 1.0, 0.5]]))
+    >>> slam.mean("drone")[:3].round(2)
+    array([1.  , 0.5 , 0.25])
+    """
 
     _: KW_ONLY
     sigma_z_m: Annotated[float | None, Within(gt=0), "Noise of the height; sigma_m if absent."] = None
@@ -343,7 +364,14 @@ class Gps3D(_Gps):
 
 @register("sensor", "absolute_pose")
 class AbsolutePose2D(StateSensor):
-    """A pose in the map's frame: motion capture, another localisation."""
+    """A pose in the map's frame: motion capture, another localisation.
+
+    >>> own = km.Mount(km.sensors.AbsolutePose2D())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}, cov=np.eye(3)))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[2.0, 1.0, 0.3]]))
+    >>> slam.mean("rover").round(2)
+    array([2. , 1. , 0.3])
+    """
 
     sigma_m: Annotated[Positive, "Noise of each coordinate."] = 0.01
     sigma_theta_rad: Annotated[Positive, "Noise of the heading."] = 0.01
@@ -380,7 +408,14 @@ class AbsolutePose3D(StateSensor):
 
 @register("sensor", "height")
 class Height(StateSensor):
-    """Height above the map's origin: a barometer, with the drift of its bias."""
+    """Height above the map's origin: a barometer, with the drift of its bias.
+
+    >>> own = km.Mount(km.sensors.Height())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}, cov=np.eye(6)))
+    >>> report = slam.process(km.Scan(0.0, "drone", "own", [[1.5]]))
+    >>> slam.mean("drone")[:3].round(2)
+    array([0.  , 0.  , 1.38])
+    """
 
     sigma_z_m: Annotated[Positive, "Noise of the height."] = 0.3
     _: KW_ONLY

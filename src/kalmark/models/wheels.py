@@ -117,6 +117,9 @@ class DifferentialDrive(PlanarMotion):
     that ended at its time; the robot moved on an arc.  The noise of a wheel's way is white along it, so it grows with
     the way that this wheel has rolled, however often the wheels are read (Chong and Kleeman 1997).  Radii and track
     with sigmas above 0 are in the map and are estimated.
+
+    >>> km.motion.DifferentialDrive().move(np.zeros(3), np.array((10.0, 12.0)), 0.1)[0].round(3)
+    array([1.071, 0.217, 0.4  ])
     """
 
     left_radius_m: Annotated[Positive, "Radius of the left wheel."] = 0.1
@@ -189,6 +192,9 @@ class Tricycle(Steered):
     """A tricycle with a steered and driven front wheel: its speed and its angle, each held until the next control.
 
     A control is u = (speed of the front wheel m/s, steering rad); the state is the rear axle's centre.
+
+    >>> km.motion.Tricycle().move(np.zeros(3), np.array((1.0, 0.2)), 1.0)[0].round(3)
+    array([0.974, 0.097, 0.199])
     """
 
     wheelbase_m: Annotated[Positive, "Distance from the rear axle to the front wheel."] = 1.0
@@ -212,6 +218,9 @@ class Omnidirectional(PlanarMotion):
     """Velocity in any direction and turn rate, each held until the next control.
 
     A control is u = (vx m/s, vy m/s, w rad/s) in the robot's frame; the robot moves on the exact arc.
+
+    >>> km.motion.Omnidirectional().move(np.zeros(3), np.array((1.0, 0.5, 0.2)), 1.0)[0].round(3)
+    array([0.944, 0.596, 0.2  ])
     """
 
     sigma_vx_mps: Annotated[NotNegative, "Error of the velocity held over its interval, forward."] = 0.1
@@ -250,6 +259,9 @@ class Mecanum(PlanarMotion):
     determine three velocities by least squares (Taheri, Qiao and Ghaeminezhad 2015), with l half of wheelbase and track
     together and R the radius: vx = R/4 (fl + fr + rl + rr), vy = R/4 (-fl + fr + rl - rr),
     w = R/4 (-fl + fr - rl + rr) / l.
+
+    >>> km.motion.Mecanum().move(np.zeros(3), np.array((5.0, 5.0, 5.0, 5.0)), 1.0)[0].round(3)
+    array([0.5, 0. , 0. ])
     """
 
     radius_m: Annotated[Positive, "Radius of the wheels."] = 0.1
