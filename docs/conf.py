@@ -77,7 +77,7 @@ html_static_path = ["site/static"]
 html_css_files = ["kalmark.css"]
 html_show_sourcelink = False
 html_copy_source = False
-html_search_scorer = "site/search.js"
+html_search_scorer = str(DOCS / "site" / "search.js")
 html_sidebars = {"index": []}
 html_theme_options = {
     "logo": {"text": "kalmark"},
