@@ -66,7 +66,7 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
             waited.append(True)
 
     def begin() -> None:
-        compiled.compile_on_second_core(positive_sum, compile_correction, "textbook", "none", 1, False)
+        compiled.compile_on_second_core(positive_sum, compile_correction, "textbook", "none", 1, False, False)
 
     monkeypatch.setattr(compiled.subprocess, "Popen", Started)
     monkeypatch.setattr(compiled, "cache_folder", lambda part: str(tmp_path))
@@ -86,7 +86,7 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
 def test_a_job_that_fails_is_not_taken_for_done(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     with pytest.raises(KeyError):
-        compiled.work_ahead('["kalmark.filter.corrections", "compile_correction", "no", "none", 1, false]', str(mark))
+        compiled.work_ahead('["kalmark.filter.corrections", "compile_correction", "no", "none", 1, false, false]', str(mark))
     assert not mark.exists()
 
 

@@ -434,7 +434,7 @@ class _Filter:
             address_of(prediction.compiled_predicted, PREDICT), address_of(correct, CORRECT),
             corrections.generator_address(1),
         )  # fmt: skip
-        self.routines = corrections.routines(1, False)
+        self.routines = corrections.routines(1, False, False)
         self.view, self.motion = channel.models["point"].model, step_of(robot.motion)
         rows = 3 + 2 * np.arange(landmarks)
         columns = (rows, 2, rows, 2, np.arange(landmarks) + 2, 1)

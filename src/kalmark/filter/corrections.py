@@ -22,17 +22,17 @@ from numba.extending import overload
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
-from kalmark.filter import parallax
+from kalmark.filter import gauge_transport, parallax
 from kalmark.filter.gauge_transport import (
-    carry,
-    displacement_columns,
+    call_carry,
+    call_displacement,
+    call_heading_last,
+    call_regression,
+    call_turn_matrices,
     extend_rows,
     gauge,
-    heading_last,
     is_level,
-    regression_on_units,
     rotation_at,
-    turn_matrices,
     turning_rows,
     units,
 )
@@ -69,7 +69,7 @@ from kalmark.filter.parallax import inverse_distance_table
 from kalmark.geometry.spaces import Table, generator, generator_plane, retract, retract_plane
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
-Routines = tuple[int, int, int, int, int, int, int, int]  # addresses, see `routines`
+Routines = tuple[int, int, int, int, int, int, int, int, int, int, int, int, int]  # addresses, see `routines`
 Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
 Sizes = tuple[int, int, int, int, int, int]  # see `observed_block`
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
@@ -77,17 +77,18 @@ Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
 TO_ITERATE = (
-    f"{VIEW}, UniTuple(i8, 8), UniTuple(i8, 6), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
+    f"{VIEW}, UniTuple(i8, 13), UniTuple(i8, 6), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
     "Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
 )
 ITERATE = signature_of(f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({TO_ITERATE})")
 TO_CORRECT = (  # all but the last argument
-    f"{VIEW}, Tuple((f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8, UniTuple(i8, 8))), "
+    f"{VIEW}, Tuple((f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8, UniTuple(i8, 13))), "
     "Tuple((i8, i8, i8[::1], i8, f8[:, ::1], f8[:, :, ::1], f8))"
 )
 ROUNDS, SETTLED = 20, 0.01  # of Huber's weights, and by how much these may still change
 call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
-_RETRACT, _GENERATOR, _ITERATE, _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8)
+_RETRACT, _GENERATOR, _ITERATE, _REGRESSION, _HEADING_LAST, _TURN_MATRICES, _CARRY, _DISPLACEMENT = range(8)
+_SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8, 13)
 
 
 @cache
@@ -97,21 +98,23 @@ def generator_address(axes: int) -> int:
 
 
 @cache
-def routines(axes: int, inverse_depths: bool) -> Routines:
+def routines(axes: int, inverse_depths: bool, dependent: bool) -> Routines:
     """Return the addresses of what a correction calls in a map of these axes, compiled now.
 
-    They are `retract`, `generator` and `iterate`, and what inverse distances need, 0 where there are none.
+    They are `retract`, `generator` and `iterate`, what moves vectors that may be `dependent` on a mount or on an
+    inertial unit, and what inverse distances need, 0 where there are none.
     """
     iterates = address_of(compiled_iterate, ITERATE)  # first: what `compile_correction` does is waited for here
     first = address_of(retract_plane if axes == 1 else retract, RETRACT), generator_address(axes), iterates
-    return (*first, *((sensor_address(axes), *parallax.addresses()) if inverse_depths else (0, 0, 0, 0, 0)))
+    rays = (sensor_address(axes), *parallax.addresses()) if inverse_depths else (0, 0, 0, 0, 0)
+    return (*first, *gauge_transport.addresses(dependent), *rays)
 
 
-def compile_correction(name: str, option: str, axes: int, inverse_depths: bool) -> None:
+def compile_correction(name: str, option: str, axes: int, inverse_depths: bool, dependent: bool) -> None:
     """Compile one of the corrections below, whose last argument has the type `option`, and its routines."""
     address_of(compiled_iterate, ITERATE)
     globals()[f"compiled_{name}"].compile(signature_of(f"none({TO_CORRECT}, {option})").args)
-    routines(axes, inverse_depths)
+    routines(axes, inverse_depths, dependent)
 
 
 @compiled
@@ -169,7 +172,8 @@ def iterate(
     theta = turning[0]
     correction, origin = np.zeros(len(P_ss)), mean[:3].copy()
     R_r = rotation_at(mean, 0, axes)
-    L = regression_on_units(take_rows(P_ss, theta, len(P_ss)), theta, table, turning, axes, R_r, ways[_SPREAD] != 0)
+    B = take_rows(P_ss, theta, len(P_ss))
+    L = call_regression(ways[_REGRESSION], (B, theta, table, turning, axes, R_r, ways[_SPREAD] != 0))
     then = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
     turn = np.zeros(axes)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
@@ -182,7 +186,7 @@ def iterate(
         rows = np.arange(S.shape[1])
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P_ss, rows, mean, s, S, depths)))
         s_j, S_j = s, S
-    x_j, (E, W, d) = mean, turn_matrices(turn, correction, turning, axes)
+    x_j, (E, W, d) = mean, call_turn_matrices(ways[_TURN_MATRICES], (turn, correction, turning, axes))
     for j in range(most):
         if j > 0:
             _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, (len(mean) - head) // k), y)
@@ -190,7 +194,9 @@ def iterate(
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            a = displacement_columns(table, now, then, L, E, d, turning, theta, R_r, rotation_at(x_j, 0, axes), level)
+            R_now = rotation_at(x_j, 0, axes)
+            moved = table, now, then, L, E, d, turning, theta, R_r, R_now, level
+            a = call_displacement(ways[_DISPLACEMENT], moved)
             transport_rows(H, v, a, theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, h + others)
         M, positive = cholesky_inverse(Z)
@@ -201,10 +207,10 @@ def iterate(
             break
         x_j = mean.copy()
         turn = gauge(mean, correction, turning, axes)
-        step = heading_last(correction, turn, level, 3)
-        E, W, d = turn_matrices(turn, step, turning, axes)
+        step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, 3))
+        E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, step, turning, axes))
         call_retract(ways[_RETRACT], (table, x_j, step, turn))
-        carry(table, x_j, L, W, d)
+        call_carry(ways[_CARRY], (table, x_j, L, W, d))
         if len(depths):
             s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
             d_head = correction[: S.shape[1]]
@@ -306,7 +312,8 @@ def invariant(
     turning = turning_rows(table, sizes, linear[1])
     theta = take_indices(index, turning[0])
     R_r = rotation_at(x, at, axes)
-    L = regression_on_units(take_rows(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
+    B = take_rows(P, theta, n)
+    L = call_regression(ways[_REGRESSION], (B, theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0))
     then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     V, correction = gain(sparse_product(H, take_rows(P, index, n), h + sizes[4], count), M, v)
     depths = inverse_distance_table(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
@@ -318,12 +325,14 @@ def invariant(
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
     own = take_values(correction, index)
     turn = gauge(mean, own, turning, axes)
-    step = heading_last(correction, turn, sizes[5], blocks[robot, 2] + 3)
-    E, W, d_lean = turn_matrices(turn, take_values(step, index), turning, axes)
+    step = call_heading_last(ways[_HEADING_LAST], (correction, turn, sizes[5], blocks[robot, 2] + 3))
+    E, W, d_lean = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_values(step, index), turning, axes))
     call_retract(ways[_RETRACT], (atoms, x, step, turn))
-    carry(atoms, x, L, W, d_lean)
+    call_carry(ways[_CARRY], (atoms, x, L, W, d_lean))
     now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    a = displacement_columns(atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5])
+    R_now = rotation_at(x, at, axes)
+    moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, R_now, sizes[5]
+    a = call_displacement(ways[_DISPLACEMENT], moved)
     downdate_and_transport(P, V, a, theta)
     if len(depths):
         observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
@@ -441,21 +450,22 @@ def correct_by_average(
     at, origin, turning = blocks[robot, 0], mean[:3].copy(), turning_rows(table, sizes, H)
     theta, own = take_indices(index, turning[0]), correction[index]
     R_r = rotation_at(x, at, axes)
-    L = regression_on_units(take_rows(P, theta, n), theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0)
+    B = take_rows(P, theta, n)
+    L = call_regression(ways[_REGRESSION], (B, theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0))
     then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
     step, turn = correction, gauge(mean, own, turning, axes) if transports else np.zeros(0)
     if transports:
-        step = heading_last(correction, turn, sizes[5], blocks[robot, 2] + 3)
+        step = call_heading_last(ways[_HEADING_LAST], (correction, turn, sizes[5], blocks[robot, 2] + 3))
     call_retract(ways[_RETRACT], (atoms, x, step, turn))
     downdate(P, V)
     add_square(P, spread)
     if transports:
-        E, W, d_lean = turn_matrices(turn, take_values(step, index), turning, axes)
-        carry(atoms, x, L, W, d_lean)
+        E, W, d_lean = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_values(step, index), turning, axes))
+        call_carry(ways[_CARRY], (atoms, x, L, W, d_lean))
         now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-        a = displacement_columns(
-            atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5]
-        )
+        R_now = rotation_at(x, at, axes)
+        moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, R_now, sizes[5]
+        a = call_displacement(ways[_DISPLACEMENT], moved)
         transport(P, a, theta)
     return d2, True
 

@@ -87,8 +87,8 @@ class Estimator(Protocol):
 class CompilingEstimator(Protocol):
     """An estimator that is compiled, and can begin with that before it is needed."""
 
-    def compile_ahead(self, axes: int, inverse_depths: bool) -> None:
-        """Begin to compile the correction of a map of these axes on a second core."""
+    def compile_ahead(self, axes: int, inverse_depths: bool, dependent: bool) -> None:
+        """Begin to compile the correction of a map of these axes, as `corrections.routines`, on a second core."""
 
 
 @runtime_checkable

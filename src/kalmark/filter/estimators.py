@@ -65,10 +65,11 @@ class _Estimator:
     from_first: ClassVar[bool] = False  # whether displacements count from the first estimates
     transports: ClassVar[bool] = False  # whether a correction turns the coordinates of errors
 
-    def compile_ahead(self, axes: int, inverse_depths: bool) -> None:
+    def compile_ahead(self, axes: int, inverse_depths: bool, dependent: bool) -> None:
         """Begin to compile the correction of a map of these axes on a second core."""
         job, cls = corrections.compile_correction, type(self)
-        compile_on_second_core(corrections.compiled_iterate, job, cls.source.__name__, cls.option, axes, inverse_depths)
+        needs = axes, inverse_depths, dependent
+        compile_on_second_core(corrections.compiled_iterate, job, cls.source.__name__, cls.option, *needs)
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
@@ -100,7 +101,7 @@ class _Estimator:
 
     def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan, parallax: bool) -> Correction:
         run = type(self).compiled if isinstance(model, tuple) else type(self).source
-        whole = m.whole if parallax else (*m.whole[:-1], corrections.routines(m.axes, False))
+        whole = m.whole if parallax else (*m.whole[:-1], corrections.routines(m.axes, False, m.dependent))
         return Correction(*run(model, whole, scan, self._option(m)))
 
     def _one_by_one(

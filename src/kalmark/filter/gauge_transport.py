@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from kalmark.arrays import Array, Index
-from kalmark.compiled import compiled
+from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter.kernels import RAISED, cholesky_inverse, product
 from kalmark.filter.observed_block import transpose
 from kalmark.geometry.angles import exponential_v
@@ -26,6 +26,75 @@ from kalmark.geometry.spaces import ANGLE, LINEAR, OWN, ROTATION, SCALAR, TURNED
 BLIND = 1e-6  # of a Jacobian's largest number: what is smaller is zero, of a user's model by differences, too
 
 Turning = tuple[Index, int, int]  # rows of what turns, and how many are of the mount's rotation and of a lever arm
+
+TURNING = "Tuple((i8[::1], i8, i8))"
+REGRESSION = signature_of(f"f8[:, ::1](f8[:, ::1], i8[::1], i8[:, ::1], {TURNING}, i8, f8[:, ::1], b1)")
+HEADING_LAST = signature_of("f8[::1](f8[::1], f8[::1], i8, i8)")
+TURN_MATRICES = signature_of(f"Tuple((f8[:, :, ::1], f8[:, :, ::1], f8[::1]))(f8[::1], f8[::1], {TURNING}, i8)")
+CARRY = signature_of("none(i8[:, ::1], f8[::1], f8[:, ::1], f8[:, :, ::1], f8[::1])")
+DISPLACEMENT = signature_of(
+    f"f8[:, ::1](i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], {TURNING}, i8[::1], "
+    "f8[:, ::1], f8[:, ::1], i8)"
+)
+call_regression, call_heading_last, call_turn_matrices = map(by_address, (REGRESSION, HEADING_LAST, TURN_MATRICES))
+call_carry, call_displacement = by_address(CARRY), by_address(DISPLACEMENT)
+
+
+def addresses(dependent: bool) -> tuple[int, int, int, int, int]:
+    """Return the addresses of the functions below that are called by address, compiled now.
+
+    Where no mount and no inertial unit is in the map, nothing is `dependent` on other rows, and little is left of them.
+    """
+    if dependent:
+        regression, heading, matrices, move, columns = (
+            regression_on_units, heading_last, turn_matrices, carry, displacement_columns,
+        )  # fmt: skip
+    else:
+        regression, heading, matrices, move, columns = (
+            independent, correction_itself, no_matrices, carry_nothing, generators_difference,
+        )  # fmt: skip
+    return (
+        address_of(regression, REGRESSION), address_of(heading, HEADING_LAST), address_of(matrices, TURN_MATRICES),
+        address_of(move, CARRY), address_of(columns, DISPLACEMENT),
+    )  # fmt: skip
+
+
+@compiled
+def independent(
+    B: Array, index: Index, atoms: Table, turning: Turning, axes: int, R: Array, rays: bool
+) -> Array:  # fmt: skip
+    """Return `regression_on_units` on no rows (n, 0)."""
+    return np.empty((B.shape[1], 0))
+
+
+@compiled
+def correction_itself(correction: Array, turn: Array, level: int, at: int) -> Array:
+    """Return `heading_last` of a robot that is no inertial unit."""
+    return correction
+
+
+@compiled
+def no_matrices(turn: Array, correction: Array, turning: Turning, axes: int) -> tuple[Array, Array, Array]:
+    """Return `turn_matrices` of no rows."""
+    return np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty(0)
+
+
+@compiled
+def carry_nothing(atoms: Table, x: Array, L: Array, W: Array, d: Array) -> None:
+    """Move no vectors, as `carry` where none depends on other rows."""
+
+
+@compiled
+def generators_difference(
+    atoms: Table, now: Array, then: Array, L: Array, E: Array, d: Array, turning: Turning, index: Index, R: Array,
+    R_now: Array, level: int,
+) -> Array:  # fmt: skip
+    """Return `displacement_columns` where no vector depends on other rows: now - then (n, axes)."""
+    out = np.empty(now.shape)
+    for i in range(now.shape[0]):
+        for a in range(now.shape[1]):
+            out[i, a] = now[i, a] - then[i, a]
+    return out
 
 
 @compiled

@@ -174,10 +174,10 @@ def moved_noise(moved: Array, F: Array, R_u: Array, N: Array) -> tuple[Array, bo
 def predict(P: Array, n: int, index: Index, F: Array, Q: Array) -> None:
     """P <- F P F' + Q, F and Q (k, k) acting on the rows `index`.  [S] (15)-(17).  O(n)."""
     B = product(F, take_rows(P, index, n))
-    block = quadratic(F, submatrix(P, index)) + Q
+    block = quadratic(F, submatrix(P, index))
     for a in range(len(index)):
         for b in range(len(index)):
-            B[a, index[b]] = 0.5 * (block[a, b] + block[b, a])
+            B[a, index[b]] = block[a, b] + 0.5 * (Q[a, b] + Q[b, a])
         terms = 0.0
         for b in range(len(index)):  # at most the sum of all |F P F'|, of which no change needs none
             terms += abs(F[a, b]) * math.sqrt(max(P[index[b], index[b]], 0.0))

@@ -10,12 +10,14 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.errors import MapError
-from kalmark.geometry.spaces import REMOVED, RHO, Space, Table
+from kalmark.geometry.spaces import ANGLE, OWN, REMOVED, RHO, TURNED, Space, Table
 
 State = dict[str, Any]  # of a JSON file
 Read = Callable[[str, tuple[int, ...]], Array]  # of a name and the shape expected
 
 CAPACITY = 72  # an odd number of cache lines, and so its successors: rows of 2^k keep a column in few places of a cache
+
+TURNING = frozenset((ANGLE, TURNED, OWN))  # atoms of a mount and of an inertial unit
 
 X_AT, X_SIZE, P_AT, P_SIZE, ATOM_AT, ATOMS = range(6)  # columns of `blocks`
 
@@ -39,7 +41,8 @@ class Layout:
         self.spaces: list[Space | None] = []
         self.used = 0  # slots
         self.axes = 1  # of the gauge: 1 in the plane, 3 in space, 6 where translations have a generator, too
-        self.inverse_depths = False  # whether there are any, or have been
+        self.inverse_depths = False  # whether there are any, or have been,
+        self.dependent = False  # and whether a mount or an inertial unit is in the map: vectors may depend on these
         self.n = 0  # rows of P in use
         self.x_n = 0  # numbers of x in use
         self._free: dict[tuple[int, ...], list[int]] = {}
@@ -77,6 +80,7 @@ class Layout:
         self.spaces[slot], self.used = space, self.used + 1
         self.axes = max(self.axes, 6 if space.steps else space.axes)
         self.inverse_depths = self.inverse_depths or RHO in space.kinds
+        self.dependent = self.dependent or not TURNING.isdisjoint(space.kinds)
         where = self.numbers(slot)
         self.x[where] = self.x_first[where] = mean
         return slot

@@ -39,7 +39,7 @@ def append_known(read: Marginal, spaces: Sequence[Space], means: Sequence[Array]
     P[:n, :n] = kernels.submatrix(m.P, rows)
     small = StochasticMap.of(
         np.concatenate([m.x[numbers], *means]), P, np.concatenate([blocks, added]), np.concatenate([atoms, *tables]),
-        m.axes, m.inverse_depths,
+        m.axes, m.inverse_depths, m.dependent,
     )  # fmt: skip
     first = len(head)
     return Marginal(small, 0, 1 if mount >= 0 else -1, np.arange(first, own + len(spaces)))

@@ -60,6 +60,7 @@ class Map(Protocol):
     """
 
     averages: bool  # whether a scan can be fused by the mean over matchings
+    dependent: bool  # whether a mount or an inertial unit is in it
     blocks: Table
     spaces: list[Space | None]
 
@@ -146,19 +147,19 @@ class StochasticMap(Layout):
 
     @classmethod
     def of(
-        cls, x: Array, P: Array, blocks: Table, atoms: Table, axes: int, inverse_depths: bool
+        cls, x: Array, P: Array, blocks: Table, atoms: Table, axes: int, inverse_depths: bool, dependent: bool
     ) -> StochasticMap:  # fmt: skip
         """Return a map to be read only, of these arrays."""
         m = cls.__new__(cls)
         m._rows, m._numbers = {}, {}
         m.x, m.P, m.blocks, m.atoms, m.n, m.x_n = x, P, blocks, atoms, len(P), len(x)
-        m.axes, m.inverse_depths = axes, inverse_depths
+        m.axes, m.inverse_depths, m.dependent = axes, inverse_depths, dependent
         return m
 
     @property
     def whole(self) -> corrections.Map:
         """The map as compiled code takes it."""
-        ways = corrections.routines(self.axes, self.inverse_depths)
+        ways = corrections.routines(self.axes, self.inverse_depths, self.dependent)
         return self.x, self.P, self.n, self.blocks, self.atoms, self.axes, ways
 
     # ------------------------------------------------------------------ reading

@@ -119,7 +119,7 @@ class Slam(Estimate):
         if isinstance(estimator, CompilingEstimator):
             kinds = [kind for channel in self.state.channels.values() for kind in channel.landmark.space.kinds]
             axes = max(robot.motion.space.axes for robot in by_name.values())
-            estimator.compile_ahead(axes, RHO in kinds)
+            estimator.compile_ahead(axes, RHO in kinds, self.state.map.dependent)
 
     def __repr__(self) -> str:
         state = self.state

@@ -150,7 +150,7 @@ class CompressedMap(Layout):
         active = m.x, m.P, m.blocks[own], m.atoms, self._extra_rows()
         tables: tuple[Any, ...] = (*active, *self._kept(inactive), *self._displacements())
         return Marginal(
-            StochasticMap.of(*joint_marginal(*tables), self.axes, self.inverse_depths),
+            StochasticMap.of(*joint_marginal(*tables), self.axes, self.inverse_depths, self.dependent),
             int(here[0]),
             int(here[1]),
             here[2:],
