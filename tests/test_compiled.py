@@ -86,7 +86,8 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
 def test_a_job_that_fails_is_not_taken_for_done(tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     with pytest.raises(KeyError):
-        compiled.work_ahead('["kalmark.filter.corrections", "compile_correction", "no", "none", 1, false, false]', str(mark))
+        job = '["kalmark.filter.corrections", "compile_correction", "no", "none", 1, false, false]'
+        compiled.work_ahead(job, str(mark))
     assert not mark.exists()
 
 
