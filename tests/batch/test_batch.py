@@ -374,7 +374,7 @@ def test_on_lost_in_the_woods_within_1_m_only_the_invariant_filter_knows_what_it
     data: Callable[[str], Path], estimator: str, low: float, high: float
 ) -> None:
     data("lost_in_the_woods/dataset2.mat")
-    config = load_config("lost_in_the_woods", ["log.r_max=1.0", f"estimator.type={estimator}"])
+    config = load_config("lost_in_the_woods", ["log.r_max=1.0", "log.to_s=800", f"estimator.type={estimator}"])
     log = open_config_log(config)
     run = record(build_slam(config, log), log, progress=False, pictures=False)
     figures = compare_with_filter(run, solve_batch(run, log, progress=False))
