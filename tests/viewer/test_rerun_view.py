@@ -17,6 +17,7 @@ from kalmark.errors import PluginError
 from kalmark.picture_options import Picture
 from kalmark.results.record import record
 from kalmark.results.run import Run
+from kalmark.viewer.rerun_stream import eye_behind
 from kalmark.viewer.rerun_view import follow, replay
 from results_space import spiral, with_camera
 from results_world import circle, slam_for
@@ -98,6 +99,19 @@ def test_options_of_pictures_change_what_is_shown(tmp_path: Path) -> None:
     assert left_out <= whole.keys()
     assert not left_out & less.keys()
     assert {*less["/map/landmarks"]["Points3D:colors"][-1]} == {0xFF0000FF}
+
+
+def test_a_view_from_behind_the_robot_moves_with_it_and_scans_can_be_left_out(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    slam, log = with_camera(spiral(steps=3))
+    picture = Picture(view="self", sensors=False)
+    record(slam, log, progress=False, observers=[follow(slam, log, picture, tmp_path / "self.rrd")])
+    rows = rows_of(tmp_path / "self.rrd")
+    assert not [entity for entity in rows if entity.startswith("/map/scan")]
+    offset, axes = eye_behind(4.0)
+    assert offset[0] < 0 < offset[2] and np.linalg.norm(offset) == pytest.approx(1.0)
+    np.testing.assert_allclose(axes[:, 2], -offset, err_msg="it looks at the robot")
+    np.testing.assert_allclose(np.linalg.det(axes), 1.0)
 
 
 def test_cameras_of_space_have_their_images_and_expectations(tmp_path: Path) -> None:
