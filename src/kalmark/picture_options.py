@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Literal
 
 from kalmark.declare import Positive, Values, Within, refuse, register
+
+COLOURED = (
+    *("landmarks", "others", "lines", "truth", "measured"),
+    *("landmarks_used", "others_used", "landmarks_predicted", "others_predicted"),
+)
 
 
 @register("picture", "picture")
@@ -64,6 +69,12 @@ class Picture:
 
             if odd := [name for name, colour in self.colours.items() if not is_color_like(colour)]:
                 raise refuse(self, "colours", f"a colour of matplotlib for {odd[0]}: red, tab:blue, #1f5fa8, ...")
+
+    def check_colours(self, robots: Iterable[str]) -> None:
+        """Raise ModelError if a colour is of nothing that is drawn: neither of a kind of things nor of these robots."""
+        known = (*COLOURED, *robots)
+        if odd := [name for name in self.colours or () if name not in known]:
+            raise refuse(self, "colours", f"colours of {', '.join(known)}, not of {odd[0]}")
 
     def colour(self, what: str, usual: str) -> str:
         """Return the colour of a robot or of a kind of things, by default the usual one."""

@@ -202,6 +202,8 @@ def test_a_path_or_a_truth_of_another_shape_is_refused_in_one_line() -> None:
             km.draw(slam, **{key: [1.0, 2.0]})
     with pytest.raises(km.KalmarkError, match=r"limits_m is .*, expected 4 or 6 numbers"):
         km.draw(slam, limits_m=[1, 0, 0, 1])
+    with pytest.raises(km.KalmarkError, match=r"expected colours of landmarks, .*, rover, not of landmrks"):
+        km.draw(slam, colours={"landmrks": "red"})
     with pytest.raises(km.KalmarkError, match="view is 'below', expected"):
         km.draw(slam, view="below")
 

@@ -57,7 +57,7 @@ def evaluate(
 
 def drawn_by(run: Run, options: Sequence[str] | None) -> Run:
     """Return a run with options of its pictures replaced.  Raises ConfigError."""
-    from kalmark.config import Config, config_dict
+    from kalmark.config import Config, build_picture, config_dict
     from kalmark.config.reading import validate
     from kalmark.config.tree import tree_of
     from kalmark.errors import ConfigError
@@ -67,7 +67,9 @@ def drawn_by(run: Run, options: Sequence[str] | None) -> Run:
     tree = tree_of({"picture": run.config.get("picture") or {}}, options)
     if other := sorted(tree.values.keys() - {"picture"}):
         raise ConfigError(f"--set {other[0]} changes no picture of a run, expected picture.KEY=VALUE")
-    return replace(run, config=run.config | {"picture": config_dict(validate(tree, Config))["picture"]})
+    config = validate(tree, Config)
+    build_picture(config, run.history.robots)
+    return replace(run, config=run.config | {"picture": config_dict(config)["picture"]})
 
 
 def report(

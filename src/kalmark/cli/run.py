@@ -54,7 +54,8 @@ def run_log(
     if own is not None:
         refuse_other_log(own, str(log.path))
     slam = cfg.build_slam(config, log)
-    observers = () if follow is None else (follow(slam, log, cfg.build_picture(config)),)
+    picture = cfg.build_picture(config, slam.robots)
+    observers = () if follow is None else (follow(slam, log, picture),)
     whole = cfg.config_dict(config)
     return record(slam, log, progress=progress, on_error=config.log.on_error, config=whole, observers=observers)
 

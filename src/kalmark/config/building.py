@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -102,10 +102,15 @@ def slam_described(said: dict[str, Any], **given: Any) -> Slam:
     return build_slam(validate(Tree(kept, places={(): "settings"}), Config), **given)
 
 
-def build_picture(config: Config) -> Picture:
-    """Return the options of pictures that a configuration has.  Raises ModelError if they do not fit together."""
+def build_picture(config: Config, robots: Iterable[str]) -> Picture:
+    """Return the options of pictures that a configuration has, of these robots.
+
+    Raises ModelError if they do not fit together or to the robots.
+    """
     given: Picture | None = model_of(config.picture)
-    return given or USUAL
+    picture = given or USUAL
+    picture.check_colours(robots)
+    return picture
 
 
 def config_dict(config: Config) -> dict[str, Any]:

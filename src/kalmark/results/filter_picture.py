@@ -81,6 +81,7 @@ def draw(
 
 def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any, picture: Picture) -> Scene:
     """Return the scene of a filter now; the arguments are those of `draw`."""
+    picture.check_colours(slam.robots)
     world, names, whole = picture.ellipses != "shape", tuple(slam.robots), MapLandmarks.of(slam)
     d = 3 if whole.in_space else 2
     size = 3 if d == 2 else 7
