@@ -1,10 +1,10 @@
 """When a compressed map costs less than a dense one: the mean step of both, and whether `auto` takes the cheaper.
 
-    python benchmarks/map_choice.py [--sides 9 14 20 32] [--steps 400]
+    python benchmarks/map_choice.py [--sides 10 14 20 32] [--steps 400]
 
 A field of side x side landmarks, all known, ten observed a step: the nearest ones of a robot that drives in a circle
-(local), or any of the map (wide).  Processor time of one thread, the first half of the steps left out; the ratios are
-the result.
+(local), or any of the map (wide).  Processor time of one thread, the first half of the steps left out.  A line each:
+the step of the compressed map over that of the dense one, and that of `auto`; the ratios are the result.
 """
 
 from __future__ import annotations
@@ -62,10 +62,9 @@ def mean_step_us(side: int, kind: str, wide: bool, steps: int) -> tuple[float, b
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sides", type=int, nargs="+", default=[9, 14, 20, 32])
+    parser.add_argument("--sides", type=int, nargs="+", default=[10, 14, 20, 32])
     parser.add_argument("--steps", type=int, default=400)
     options = parser.parse_args()
-    print(f"{'landmarks':>9} {'scans':>6} {'dense us':>9} {'compressed us':>14} {'ratio':>6} {'auto us':>8}  auto is")
     with kernels.one_thread():
         for side in options.sides:
             for wide in (False, True):
@@ -73,9 +72,9 @@ def main() -> None:
                     mean_step_us(side, k, wide, options.steps) for k in ("dense", "postponed")
                 )
                 auto, is_compressed = mean_step_us(side, "auto", wide, options.steps)
-                name = "compressed" if is_compressed else "dense"
-                print(f"{side * side:>9} {'wide' if wide else 'local':>6} {dense:>9.0f} {compressed:>14.0f} "
-                      f"{compressed / dense:>6.2f} {auto:>8.0f}  {name}", flush=True)  # fmt: skip
+                scans, kind = "wide" if wide else "local", "compressed" if is_compressed else "dense"
+                ratios = f"{compressed / dense:.2f} {auto / dense:.2f}"
+                print(f"{side * side} {scans}: {ratios}  dense {dense:.0f} us; auto is {kind}", flush=True)
 
 
 if __name__ == "__main__":

@@ -90,8 +90,8 @@ def main() -> None:
             for place in (HERE, other):
                 measured(place, count, with_cov)
             ratios = [measured(HERE, count, with_cov) / measured(other, count, with_cov) for _ in range(PAIRS)]
-            pairs, how = " ".join(f"{ratio:.2f}" for ratio in ratios), "with cov" if with_cov else ""
-            print(f"{count:>6} landmarks {how:<8}: {pairs}  median {np.median(ratios):.2f}", flush=True)
+            pairs, how = " ".join(f"{ratio:.2f}" for ratio in ratios), " with cov" * with_cov
+            print(f"{count:>6} landmarks{how}: {pairs}  median {np.median(ratios):.2f}", flush=True)
 
 
 if __name__ == "__main__":

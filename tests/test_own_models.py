@@ -142,3 +142,20 @@ def test_a_verb_of_a_user_reads_the_run_of_his_models(own: Any, tmp_path: Path) 
     (tmp_path / "own-1.dist-info" / "entry_points.txt").write_text("[kalmark.verbs]\nwhere = my_models:where\n")
     told = [line.split() for line in kalmark("where", "run", folder=tmp_path).splitlines()]
     np.testing.assert_allclose(np.array(told, float)[:, 1:], [slam.place(name)[0] for name in SIGNS], atol=1e-3)
+
+
+def test_a_range_in_space_is_a_sensor_of_one_line() -> None:
+    beacon = km.pointwise(np.linalg.norm, [[0.05**2]], columns=("range_m",))
+    cov = np.diag([0.5, 0.5, 0.5, 0.02, 0.02, 0.1]) ** 2
+    drone = km.Robot("drone", km.motion.Odometry3D(0.05, 0.02), sensors={"radio": km.Mount(beacon)}, cov=cov)
+    slam, rng = km.Slam(drone, landmarks=km.landmarks.Point3D()), np.random.default_rng(0)
+    beacons, truth = rng.uniform(-10.0, 10.0, (8, 3)), np.array([0.4, -0.3, 0.2])
+    for i, place in enumerate(beacons):
+        slam.add_landmark(i, place)
+    for k in range(20):
+        truth = truth + np.array([0.1, 0.0, 0.0])
+        slam.process(km.Control(0.1 * k, "drone", (0.1, 0.0, 0.0, 0.0, 0.0, 0.0)))
+        y = np.linalg.norm(beacons - truth, axis=1)[:, None] + 0.05 * rng.normal(size=(8, 1))
+        slam.process(km.Scan(0.1 * k, "drone", "radio", y, ids=range(8)))
+    d, P = slam.mean("drone")[:3] - truth, slam.covariance("drone")[:3, :3]
+    assert d @ np.linalg.solve(P, d) < 14.2 and np.sqrt(np.diag(P)).max() < 0.04  # .997 of chi-square
