@@ -790,16 +790,9 @@ def structure() -> Iterator[Figure]:
     for count in (50, 1000):
         yield Figure("Structure", f"a step with {count} landmarks, as a part of that of be0e13e", ".8",
                      before.format("paired.py"), row(f"{count} landmarks:", "{6}"))  # fmt: skip
-    for count, how, wanted in ((50, "", ".4"), (50, " with cov", ".2"), (1000, "", ".5"), (1000, " with cov", "")):
+    for count, how, wanted in ((50, "", ".4"), (50, " with cov", ".2"), (1000, "", ".5")):
         yield Figure("Structure", f"a step with {count} landmarks{how}, as a part of that of 4ee926b", wanted,
                      "python benchmarks/paired.py 4ee926b", row(f"{count} landmarks{how}:", "{6}"))  # fmt: skip
-    for landmarks, scans, read in (
-        (100, "local", "{1} / {2}"),
-        (100, "wide", "{1} / {2}"),
-        (400, "local", "{1} / {2}"),
-    ):
-        yield Figure("Structure", f"{landmarks} landmarks, {scans} scans: compressed over dense / `auto` over dense", "",
-                     "python benchmarks/map_choice.py", row(f"{landmarks} {scans}:", read))  # fmt: skip
     yield Figure("Structure", "observations of the shipped real logs with another outcome than at be0e13e", "0",
                  before.format("outcomes.py"), row("all logs:", "{2} of {0}"))  # fmt: skip
 
