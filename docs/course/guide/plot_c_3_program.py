@@ -33,11 +33,9 @@ for step in range(200):
     slam.predict(U + q * rng.normal(size=2))
     for i, number in known.items():
         slam.correct(number, Y[i])  # with the gate of three sigmas, (83)
-    for i in order[step : step + 1]:
-        known[i] = slam.initialize(Y[i])
+    known |= {i: slam.initialize(Y[i]) for i in order[step : step + 1]}
     history.append((R, slam.x.copy(), slam.P.copy()))
-print(f"{len(known)} landmarks, error of the pose {(slam.x[:3] - R).round(3)}")
-print("sigmas of the pose", np.sqrt(np.diag(slam.P)[:3]).round(3))
+print(f"error of the pose {(slam.x[:3] - R).round(3)}, its sigmas {np.sqrt(np.diag(slam.P)[:3]).round(3)}")
 
 # %%
 # The picture that moves

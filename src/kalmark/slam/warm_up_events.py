@@ -12,6 +12,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.association import ByIdentity
 from kalmark.events import Control, Event, Fix, Id, Scan
+from kalmark.filter import kernels
 from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.compressed.restoring import NUMBERS
 from kalmark.filter.compressed.storage import Triangle
@@ -82,6 +83,7 @@ def rehearse(
         channel, slot = twin.state.channels.get((robot, sensor)), twin.state.moving[robot].slot
         return twin.map.mean(slot) if channel is None else channel.pose(twin.map, slot)
 
+    kernels.are_covariances(np.eye(1)[None], 0.0)  # as of an event with noise of its own
     for k, event in enumerate(rehearsal(twin.robots.values(), pose)):
         with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
             process(event)
