@@ -773,7 +773,7 @@ def structure() -> Iterator[Figure]:
         ("functions of 7 arguments or more", "30"),
         ("calls of isinstance, hasattr, getattr", "350"),
         ("functions that take the slam or its state whole", "40"),
-        ("modules that begin with a question word", "0"),
+        ("docstrings that begin with a question word", "0"),
         ("file names used more than once", "20"),
         ("imports hidden from the contract", "0"),
         ("modules in the largest import cycle", "0"),
