@@ -444,10 +444,10 @@ class Slam(Estimate):
         >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
         >>> slam = km.Slam(rover)
         >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=["door", "mast"]))
-        >>> slam.fuse(["door", "mast"], lambda a, b: np.linalg.norm(a - b), 3.28, 0.01**2).outcome  # a tape measure
+        >>> slam.fuse(["door", "mast"], lambda a, b: np.linalg.norm(a - b), 3.95, 0.01**2).outcome  # a tape measure
         'associated'
         >>> float(np.linalg.norm(slam.mean("door") - slam.mean("mast")).round(2))
-        3.28
+        3.95
         """
         done = correct_by_factor(self.state, names, factor_of(names, expect, y, cov, angular), gate)
         self.state.settle()
