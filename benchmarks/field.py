@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import kalmark as km
+from kalmark.filter.compressed.compressed_map import CompressedMap
 
 SPACING_M, LANE_M, STEP_M, REACH_M, VIEW = 2.0, 6.0, 0.2, 4.0, 10
 ODOMETRY, SIGHT = np.array([0.01, 0.0, 0.02]), np.array([0.1, 0.02])
@@ -77,3 +78,18 @@ def new_slam(start: Any, map_: str = "auto", association: km.association.Associa
     lidar = km.Mount(km.sensors.RangeBearing(*SIGHT))
     robot = km.Robot("r", km.motion.Odometry2D(*ODOMETRY), start, {"lidar": lidar})
     return km.Slam([robot], association or km.association.ByIdentity("off"), map=map_)
+
+
+def known_field(side: int, map_: str) -> tuple[Field, km.Slam]:
+    """Return a square field and a Slam that knows all its landmarks."""
+    field = Field(side, side)
+    slam = field.slam(map_)
+    for i, landmark in enumerate(field.landmarks):
+        slam.add_landmark(i, landmark, 0.01 * np.eye(2))
+    if isinstance(slam.map, CompressedMap):
+        slam.map.full_update()
+        slam.map.finish()
+    else:
+        while slam.map.prepare():  # the larger buffer, which else comes bit by bit with the first hundred steps
+            pass
+    return field, slam

@@ -690,7 +690,7 @@ def speed() -> Iterator[Figure]:
                      row(start, "{0} us / {3}"))  # fmt: skip
     yield Figure(section, "1,024 landmarks, 10 observed: control / scan / both over their compiled kernels", "60 us together / 2", command,
                  row("the map that Slam chooses, 10 seen a step:", "{1} us / {4} us / {6}"))  # fmt: skip
-    yield Figure(section, "dense step, 1,024 landmarks, 6 observed, over the dsyrk of its covariance", "1.6", command,
+    yield Figure(section, "dense step, 1,024 landmarks, 6 observed, over the update of its covariance", "1.6", command,
                  row("1,024 landmarks, dense, 6 seen a step:", "{6}"))  # fmt: skip
     peers = "python benchmarks/peers.py"
     yield Figure(section, "a step at 50 / 100 / 200 / 1,000 / 10,000 landmarks, 10 observed: `Slam.process`", "", peers,

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 
 import numpy as np
-from field import ODOMETRY, SIGHT, Field, Step
+from field import ODOMETRY, SIGHT, Field, Step, known_field
 
 import kalmark as km
 from kalmark.filter import kernels
@@ -22,17 +22,6 @@ from kalmark.filter.compressed.compressed_map import CompressedMap
 
 SEEN = 10
 MOVE = np.array([0.05, 0.0, 0.02])
-
-
-def known_field(field: Field, kind: str) -> km.Slam:
-    """Return a Slam that knows a field."""
-    slam = field.slam(kind)
-    for i, landmark in enumerate(field.landmarks):
-        slam.add_landmark(i, landmark, 0.01 * np.eye(2))
-    if isinstance(slam.map, CompressedMap):
-        slam.map.full_update()
-        slam.map.finish()
-    return slam
 
 
 def wide_steps(field: Field, steps: int) -> Iterator[Step]:
@@ -49,8 +38,7 @@ def wide_steps(field: Field, steps: int) -> Iterator[Step]:
 
 def mean_step_us(side: int, kind: str, wide: bool, steps: int) -> tuple[float, bool]:
     """Return the mean microseconds of a step, and whether the map is compressed in the end."""
-    field, spent = Field(side, side), []
-    slam = known_field(field, kind)
+    (field, slam), spent = known_field(side, kind), []
     for control, scan in wide_steps(field, steps) if wide else field.circle(steps, view=SEEN):
         begin = time.thread_time_ns()
         slam.process(control)

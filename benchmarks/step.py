@@ -7,7 +7,7 @@ read; its bare compiled kernels; the textbook filter in NumPy; GTSAM's iSAM2 wit
 gtsam is installed).  The ratios are the result; the machine's microseconds are for orientation.
 
 Then, on a circle in a field of known landmarks, 2 m apart: the dense step with 6 landmarks in view over the bare update
-of its covariance (dsyrk), by turns of 20; and the step of the map that Slam chooses with 10 in view, by parts.
+of its covariance, by turns of 20; and the step of the map that Slam chooses with 10 in view, by parts.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from field import ODOMETRY, SIGHT, Field, Step, new_slam
+from field import ODOMETRY, SIGHT, Step, known_field, new_slam
 from ways import Isam2, Known, Process, Textbook, Way, conditions, in_turns, pin
 
 import kalmark as km
 from kalmark.filter import corrections, kernels, prediction
-from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.estimators import Invariant
 from kalmark.geometry.frames import compose
 
@@ -112,21 +111,6 @@ def table(spent: dict[str, np.ndarray], count: int) -> dict[str, Any]:
     return rows
 
 
-def known_field(map_: str) -> tuple[Field, km.Slam]:
-    """Return a field and a Slam that knows all its landmarks."""
-    field = Field(SIDE, SIDE)
-    slam = field.slam(map_)
-    for i, landmark in enumerate(field.landmarks):
-        slam.add_landmark(i, landmark, 0.01 * np.eye(2))
-    if isinstance(slam.map, CompressedMap):
-        slam.map.full_update()
-        slam.map.finish()
-    else:
-        while slam.map.prepare():  # the larger buffer, which else comes bit by bit with the first hundred steps
-            pass
-    return field, slam
-
-
 def spent_us(call: Callable[..., Any], *arguments: Any) -> float:
     """Return the microseconds of processor time that a call takes."""
     begin = time.thread_time_ns()
@@ -136,7 +120,7 @@ def spent_us(call: Callable[..., Any], *arguments: Any) -> float:
 
 def dense_over_floor(steps: int) -> dict[str, float]:
     """Return the median step of a dense map and 6 sightings, and that of the update of its covariance alone."""
-    field, slam = known_field("dense")
+    field, slam = known_field(SIDE, "dense")
     V = np.full((2 * SIGHTINGS, slam.map.n), 1e-9)
     taken, bare = [], []
     for _ in range(steps // TURN):
@@ -144,12 +128,12 @@ def dense_over_floor(steps: int) -> dict[str, float]:
             taken.append(spent_us(slam.process, control) + spent_us(slam.process, scan))
         bare += [spent_us(kernels.downdate, slam.map.P, V) for _ in range(TURN)]
     step, floor = float(np.median(taken[TURN:])), float(np.median(bare))
-    return {"landmarks": SIDE * SIDE, "step_us": step, "dsyrk_us": floor, "ratio": step / floor}
+    return {"landmarks": SIDE * SIDE, "step_us": step, "update_us": floor, "ratio": step / floor}
 
 
 def parts(steps: int) -> dict[str, float]:
     """Return the medians of a control, a scan of 10 landmarks, and the compiled prediction and correction in them."""
-    field, slam = known_field("auto")
+    field, slam = known_field(SIDE, "auto")
     kernels_us: dict[str, list[float]] = {"prediction": [], "correction": []}
 
     def timed(name: str, kernel: Callable[..., Any]) -> Callable[..., Any]:
@@ -187,7 +171,7 @@ def main() -> None:
         rows = {str(n): table(measure(n, options.steps), n) for n in options.landmarks}
         dense, chosen = dense_over_floor(options.steps // 3), parts(2 * options.steps)
     print(f"\n{dense['landmarks']:,} landmarks, dense, {SIGHTINGS} seen a step: {dense['step_us']:.0f} us,", end=" ")
-    print(f"dsyrk {dense['dsyrk_us']:.0f} us, ratio {dense['ratio']:.2f}")
+    print(f"update {dense['update_us']:.0f} us, ratio {dense['ratio']:.2f}")
     kernels_us = chosen["prediction_us"] + chosen["correction_us"]
     print(f"the map that Slam chooses, {IN_VIEW} seen a step: control {chosen['control_us']:.1f} us,", end=" ")
     times = (chosen["control_us"] + chosen["scan_us"]) / kernels_us

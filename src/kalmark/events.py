@@ -240,7 +240,8 @@ class Control(_Timed):
 
     `u` has the motion model's shape and units; `cov` (same size, squared) overrides the model's own noise.
     `share` is less than 1 for a part of an increment, whose noise is that share of the whole one's, `cov` or the
-    model's, and the variances `uneven` (k,) besides.  `largest` is the largest magnitude in `u`, `vaguest` in `cov`.
+    model's, and the variances `uneven` (k,) besides.  `largest` is the largest magnitude in `u`, `largest_cov` that
+    in `cov`.
 
     >>> km.Control(t_s=0.5, robot="rover", u=(0.5, 0.02)).t_ns
     500000000
@@ -253,7 +254,7 @@ class Control(_Timed):
     share: float
     uneven: Array | None
     largest: float = field(init=False, repr=False)
-    vaguest: float = field(init=False, repr=False)
+    largest_cov: float = field(init=False, repr=False)
 
     def __init__(
         self,
@@ -278,9 +279,9 @@ class Control(_Timed):
             u, largest = finite_and_largest(u, "u", MOST_OTHER)
             set_(self, "u", u)
             set_(self, "largest", largest)
-            cov, vaguest = (None, 0.0) if cov is None else finite_and_largest(cov, "cov", MOST_OTHER**2)
+            cov, largest_cov = (None, 0.0) if cov is None else finite_and_largest(cov, "cov", MOST_OTHER**2)
             set_(self, "cov", cov)
-            set_(self, "vaguest", vaguest)
+            set_(self, "largest_cov", largest_cov)
         except EventError as error:
             raise EventError(f"control of {short_text(robot)} at t={seconds_text(t_ns)} s: {error}") from None
 
@@ -291,7 +292,7 @@ class Scan(_Timed):
 
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
     overrides the noise of the sensor model.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
-    `width` is the m it was given, 0 for (), `largest` the largest magnitude in `y`, `vaguest` in `cov`.
+    `width` is the m it was given, 0 for (), `largest` the largest magnitude in `y`, `largest_cov` in `cov`.
 
     >>> km.Scan(t_s=0.5, robot="rover", sensor="lidar", y=[[4.2, 0.3], [2.0, -0.1]], ids=[7, None]).ids
     (7, None)
@@ -305,7 +306,7 @@ class Scan(_Timed):
     cov: Array | None
     width: int = field(init=False, repr=False)
     largest: float = field(init=False, repr=False)
-    vaguest: float = field(init=False, repr=False)
+    largest_cov: float = field(init=False, repr=False)
 
     def __init__(
         self,
@@ -330,9 +331,9 @@ class Scan(_Timed):
             set_(self, "width", y.shape[1])
             set_(self, "y", y if len(y) else y.reshape(0, 0))
             set_(self, "ids", None if ids is None else checked_ids(ids, len(y)))
-            cov, vaguest = (None, 0.0) if cov is None else finite_and_largest(cov, "cov", MOST_OTHER**2)
+            cov, largest_cov = (None, 0.0) if cov is None else finite_and_largest(cov, "cov", MOST_OTHER**2)
             set_(self, "cov", cov)
-            set_(self, "vaguest", vaguest)
+            set_(self, "largest_cov", largest_cov)
         except EventError as error:
             what = f"scan of {short_text(robot)} by {short_text(sensor)} at t={seconds_text(t_ns)} s"
             raise EventError(f"{what}: {error}") from None

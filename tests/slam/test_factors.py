@@ -132,6 +132,17 @@ def test_two_robots_measure_each_other() -> None:
     assert 5.2 < np.mean(nees) < 6.8
 
 
+def test_a_gap_that_is_noticed_by_a_factor_is_in_the_next_report_of_its_robot() -> None:
+    lidar = {"lidar": km.Mount(km.sensors.RangeBearing(*SIGHT))}
+    slam = km.Slam([km.Robot("one", km.motion.Unicycle(), sensors=lidar), rover("two", (5.0, 0.0, 0.0))])
+    for k in range(100):
+        slam.process(km.Control(0.1 * k, "one", (0.1, 0.0)))
+    slam.process(km.Scan(60.0, "two", "lidar", [[1.0, 0.0]], ids=[1]))
+    slam.fuse(["one", "two"], distance, 3.0, 4.0)
+    (gap,) = slam.process(km.Scan(60.1, "one", "lidar", [[3.0, 0.0]], ids=[2])).gaps
+    assert gap.robot == "one" and gap.lasts_s > 45.0
+
+
 def test_landmarks_that_are_said_to_be_in_one_place_are() -> None:
     slam, rng = mapped(), np.random.default_rng(9)
     y = km.geometry.observe(slam.mean("rover"), PLACES[:1])[0] + rng.normal(size=(1, 2)) * SIGHT
@@ -189,6 +200,14 @@ def test_what_is_outside_the_gate_changes_nothing() -> None:
         (lambda slam: slam.fuse([1], lambda a: np.inf, 1.0, 1.0), EventError, "expected 1 finite numbers"),
         (lambda slam: slam.fuse([1], lambda a: a, (0, 0), np.eye(2), angular=(True,)), EventError, "2 truth values"),
         (lambda slam: slam.fuse([1], lambda a: a, (0, 0), np.eye(2), gate=0.0), EventError, "a probability above 0"),
+        (lambda slam: slam.fuse([1], lambda a: a, (0, 0), np.eye(2), gate="wide"), EventError, "a probability above 0"),
+        (lambda slam: slam.fuse("12", distance, 1.0, 1.0), EventError, "landmarks, in a list"),
+        (lambda slam: slam.fuse([[1], 2], distance, 1.0, 1.0), EventError, "a name is [1], expected a whole number"),
+        (lambda slam: slam.fuse([1, 2], None, 1.0, 1.0), EventError, "expect is None, expected a function"),
+        (lambda slam: slam.fuse([1, 2], lambda a, b: None, 1.0, 1.0), EventError, "expected 1 finite numbers"),
+        (lambda slam: slam.fuse([1, 2], lambda a, b: [a, 1.0], 1.0, 1.0), EventError, "expected 1 finite numbers"),
+        (lambda slam: slam.fuse([1, 2], distance, [], np.eye(0)), EventError, "y is empty"),
+        (lambda slam: slam.fuse([1], lambda a: a, (0, 0), np.eye(2), angular=1), EventError, "2 truth values"),
     ],
 )
 def test_bad_factors_are_refused_and_change_nothing(

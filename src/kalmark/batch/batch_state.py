@@ -13,7 +13,6 @@ import scipy.sparse as sp
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled, python_form
 from kalmark.errors import KalmarkError
-from kalmark.filter.kernels import product
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian_inverse
@@ -115,7 +114,7 @@ def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
     _, z_0, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
     k, p, h, n = len(y), z_0.shape[1], H_0.shape[2], L_0.shape[2]
     z, E = np.empty((k, p)), np.empty((k, p, h + n))
-    for i in range(k):  # element by element: numba compiles the check of a slice's shape for 5 s
+    for i in range(k):  # element by element: numba compiles slices for a second more
         _, z_i, H_i, L_i = linearize(view, head[i], l[i : i + 1], y[i : i + 1])
         for a in range(p):
             z[i, a] = z_i[0, a]
@@ -153,15 +152,7 @@ def _step_residuals_in_space(a: Array, b: Array, step: Array) -> tuple[Array, Ar
     for i in range(n):
         back, B_a = frames3d.inverse(a[i])
         d, D_back, D_b = frames3d.compose(back, b[i])
-        q, D_a = frames3d.minus(d, step[i]), product(D_back, B_a)
-        L = left_jacobian_inverse(q[3:].copy())
-        for j in range(6):
-            w[i, j] = q[j]
-            for c in range(12):
-                W[i, j, c] = 0.0
-                if j < 3:
-                    W[i, j, c] = D_a[j, c] if c < 6 else D_b[j, c - 6]
-                else:
-                    for m in range(3):
-                        W[i, j, c] += L[j - 3, m] * (D_a[3 + m, c] if c < 6 else D_b[3 + m, c - 6])
+        w[i] = frames3d.minus(d, step[i])
+        W[i, :, :6], W[i, :, 6:] = D_back @ B_a, D_b
+        W[i, 3:] = left_jacobian_inverse(w[i, 3:]) @ W[i, 3:].copy()
     return w, W

@@ -69,7 +69,7 @@ from kalmark.filter.parallax import inverse_distance_table
 from kalmark.geometry.spaces import Table, generator, generator_plane, retract, retract_plane
 from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
-Routines = tuple[int, int, int, int, int, int, int, int, int, int, int, int, int]  # addresses, see `routines`
+Routines = tuple[int, ...]  # 13 addresses, see `routines`
 Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
 Sizes = tuple[int, int, int, int, int, int]  # see `observed_block`
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
@@ -194,8 +194,7 @@ def iterate(
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
             now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            R_now = rotation_at(x_j, 0, axes)
-            moved = table, now, then, L, E, d, turning, theta, R_r, R_now, level
+            moved = table, now, then, L, E, d, turning, theta, R_r, rotation_at(x_j, 0, axes), level
             a = call_displacement(ways[_DISPLACEMENT], moved)
             transport_rows(H, v, a, theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, h + others)
@@ -330,8 +329,7 @@ def invariant(
     call_retract(ways[_RETRACT], (atoms, x, step, turn))
     call_carry(ways[_CARRY], (atoms, x, L, W, d_lean))
     now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    R_now = rotation_at(x, at, axes)
-    moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, R_now, sizes[5]
+    moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5]
     a = call_displacement(ways[_DISPLACEMENT], moved)
     downdate_and_transport(P, V, a, theta)
     if len(depths):
@@ -463,8 +461,7 @@ def correct_by_average(
         E, W, d_lean = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_values(step, index), turning, axes))
         call_carry(ways[_CARRY], (atoms, x, L, W, d_lean))
         now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-        R_now = rotation_at(x, at, axes)
-        moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, R_now, sizes[5]
+        moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5]
         a = call_displacement(ways[_DISPLACEMENT], moved)
         transport(P, a, theta)
     return d2, True

@@ -40,23 +40,15 @@ call_regression, call_heading_last, call_turn_matrices = map(by_address, (REGRES
 call_carry, call_displacement = by_address(CARRY), by_address(DISPLACEMENT)
 
 
-def addresses(dependent: bool) -> tuple[int, int, int, int, int]:
-    """Return the addresses of the functions below that are called by address, compiled now.
+def addresses(dependent: bool) -> tuple[int, ...]:
+    """Return the addresses of the five functions below that are called by address, compiled now.
 
     Where no mount and no inertial unit is in the map, nothing is `dependent` on other rows, and little is left of them.
     """
-    if dependent:
-        regression, heading, matrices, move, columns = (
-            regression_on_units, heading_last, turn_matrices, carry, displacement_columns,
-        )  # fmt: skip
-    else:
-        regression, heading, matrices, move, columns = (
-            independent, correction_itself, no_matrices, carry_nothing, generators_difference,
-        )  # fmt: skip
-    return (
-        address_of(regression, REGRESSION), address_of(heading, HEADING_LAST), address_of(matrices, TURN_MATRICES),
-        address_of(move, CARRY), address_of(columns, DISPLACEMENT),
-    )  # fmt: skip
+    whole = regression_on_units, heading_last, turn_matrices, carry, displacement_columns
+    little = independent, correction_itself, no_matrices, carry_nothing, generators_difference
+    signatures = REGRESSION, HEADING_LAST, TURN_MATRICES, CARRY, DISPLACEMENT
+    return tuple(map(address_of, whole if dependent else little, signatures))
 
 
 @compiled

@@ -71,10 +71,10 @@ class CostBalance:
 
 def compress_map(map_: Map, landmarks: Iterable[Space], numbers: str) -> Map:
     """Return a map as a compressed one, unless most landmarks are inverse distances: these are always active."""
-    rays = [RHO in space.kinds for space in landmarks]
-    if not isinstance(map_, StochasticMap) or 2 * sum(rays) > len(rays):
+    if not isinstance(map_, StochasticMap):
         return map_
-    return CompressedMap.from_dense(map_, Triangle(NUMBERS[numbers]))
+    rays = [RHO in space.kinds for space in landmarks]
+    return map_ if 2 * sum(rays) > len(rays) else CompressedMap.from_dense(map_, Triangle(NUMBERS[numbers]))
 
 
 def restore_map(state: State, read: Read) -> Map:

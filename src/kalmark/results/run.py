@@ -86,7 +86,7 @@ class Run(Recording):
         for seen in (sensor for sensor in drawable if len(steps_of(self.history, sensor))):
             figure, name = (
                 draw_sensor(self, seen.robot, seen.sensor),
-                f"{file_name(seen.robot)}_{file_name(seen.sensor)}",
+                "_".join(map(file_name, (seen.robot, seen.sensor))),
             )
             dpi = 110 if picture.sensor_width_px is None else picture.sensor_width_px / figure.get_figwidth()
             for ending in endings:

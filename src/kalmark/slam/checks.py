@@ -115,11 +115,11 @@ SMALLEST_BOUND = min(MOST.values())
 
 
 def _refuse_bad_noise(event: Control | Scan, covs: Array, columns: tuple[str, ...], *, definite: bool) -> None:
-    """Refuse the covariances (K, m, m) of an event that are none, or larger than any knowledge of these columns."""
+    """Refuse the covariances (K, m, m) of an event that are none, or have sigmas larger than means anything."""
     margin = 0.1 * SEMIDEFINITE
     if not kernels.are_covariances(covs, -margin if definite else margin):
         _refuse_indefinite(covs, f"{label_of_event(event)}: cov", definite)
-    if event.vaguest > SMALLEST_BOUND**2 and covs.shape[-1] == len(columns):
+    if event.largest_cov > SMALLEST_BOUND**2 and covs.shape[-1] == len(columns):
         sigmas = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))
         refuse_huge(sigmas, tuple(f"sigma_{column}" for column in columns), f"{label_of_event(event)}: cov")
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.errors import EventError
-from kalmark.events import Id, finite, list_names, short_text
+from kalmark.events import Id, checked_id, finite, is_number, list_names, short_text
 from kalmark.filter.estimators import Update
 from kalmark.filter.map import NO_SLOTS, Map
 from kalmark.geometry.angles import wrap
@@ -71,11 +71,12 @@ class _Block(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """A measurement y (p,) of blocks with the noise R (p, p); `expect` returns its expectation from their means.
+    """A measurement y (p,) of blocks by their `names`, with the noise R (p, p).
 
-    `angular` (p,) marks angles; `what` names it in messages.
+    `expect` returns its expectation from their means, `angular` (p,) marks angles; `what` names it in messages.
     """
 
+    names: list[Id]
     expect: Callable[..., Any]
     y: Array
     R: Array
@@ -83,8 +84,10 @@ class Factor:
     what: str
 
     def expectation(self, means: Sequence[Array]) -> Array:
-        """Return e (p,).  Raises EventError for anything else."""
-        return check_numbers(np.reshape(self.expect(*means), -1), len(self.y), f"{self.what}: expectation", EventError)
+        """Return e (p,), h at the means.  Raises EventError for anything else."""
+        e = self.expect(*means)
+        e = e.ravel() if isinstance(e, np.ndarray) else e if isinstance(e, list | tuple) else [e]
+        return check_numbers(e, len(self.y), f"{self.what}: expectation", EventError)
 
     def residual(self, a: Array, b: Array) -> Array:
         """Return a - b (p,), the angles wrapped."""
@@ -109,10 +112,10 @@ class Factor:
         for _ in range(ROUNDS):
             e, G = self.linearize(blocks, x)
             back = [b.space.minus(b.mean, now)[: b.dof] for b, now in zip(blocks, x, strict=True)]
-            value = e + G @ np.concatenate(back)
-            z, weighted = self.residual(self.y, value), np.linalg.solve(G @ P @ G.T + self.R, np.eye(len(self.y)))
-            d2 = float(z @ weighted @ z) if math.isnan(d2) else d2
-            before, step = step, P @ G.T @ weighted @ z
+            value = e + G @ np.concatenate(back)  # of h at the means, as it is linearised at x
+            z, Z = self.residual(self.y, value), G @ P @ G.T + self.R  # [S] (26)-(27)
+            d2 = float(z @ np.linalg.solve(Z, z)) if math.isnan(d2) else d2  # [S] (83)
+            before, step = step, P @ G.T @ np.linalg.solve(Z, z)  # [S] (28)-(29)
             moved = zip(blocks, np.split(step, ends), strict=False)
             x = [block.space.plus(block.mean, d) if block.dof else block.mean for block, d in moved]
             if (np.abs(step - before) <= SETTLED * np.sqrt(np.maximum(np.diag(P), 0.0))).all():
@@ -123,35 +126,47 @@ class Factor:
 
 def factor_of(names: Sequence[Id], expect: Callable[..., Any], y: Any, cov: Any, angular: Sequence[bool]) -> Factor:
     """Return a factor of the blocks `names`.  Raises EventError for numbers that it cannot have."""
-    what = f"factor of {list_names(names)}"
-    if not names or len({*names}) < len(names):
-        raise EventError(f"{what}: expected the names of different robots and landmarks")
+    own, what = _checked_names(names)
+    if not callable(expect):
+        raise EventError(f"{what}: expect is {short_text(expect)}, expected a function of the means of these")
     y = finite(y, f"{what}: y").ravel()
     p = len(y)
+    if not p:
+        raise EventError(f"{what}: y is empty, expected one number or more")
     R = check_covariance([[cov]] if p == 1 and np.ndim(cov) == 0 else cov, p, f"{what}: cov", definite=True)
-    turns = np.array([*angular] or [False] * p, dtype=np.bool_)
-    if turns.shape != (p,):
+    turns = [*angular] if isinstance(angular, list | tuple) and len(angular) in (0, p) else [None]
+    if not all(isinstance(each, bool) for each in turns):
         raise EventError(f"{what}: angular is {short_text(angular)}, expected {p} truth values")
-    return Factor(expect, y, R, turns, what)
+    return Factor(own, expect, y, R, np.array(turns or [False] * p), what)
 
 
-def correct_by_factor(state: State, names: Sequence[Id], factor: Factor, share: float) -> Observation:
-    """Correct by a measurement of the blocks `names` if d2 is within the gate of the probability `share`."""
-    if not 0.0 < share <= 1.0:
+def _checked_names(names: Any) -> tuple[list[Id], str]:
+    """Return the names of different blocks, and how messages call their factor.  Raises EventError."""
+    several = list(names) if isinstance(names, list | tuple) else []
+    what = f"factor of {list_names(several) if several else short_text(names)}"
+    own = [checked_id(name, f"{what}: a name") for name in several]
+    if not own or len({*own}) < len(own):
+        raise EventError(f"{what}: expected the names of different robots and landmarks, in a list")
+    return own, what
+
+
+def correct_by_factor(state: State, factor: Factor, share: float) -> Observation:
+    """Correct by a factor if d2 is within the gate of the probability `share`."""
+    if not is_number(share) or not 0.0 < share <= 1.0:
         raise EventError(f"{factor.what}: gate is {short_text(share)}, expected a probability above 0, 1 for no gate")
-    robots = [str(name) for name in names if name in state.robots]
+    names, robots = factor.names, [str(name) for name in factor.names if name in state.robots]
     blocks = _blocks(state.map, state.tracks, names)
     if not any(block.dof for block in blocks):
         raise EventError(f"{factor.what}: all of these are known exactly, expected one that is estimated")
     factor.linearize(blocks, [block.mean for block in blocks])  # what is wrong with it shows before anything moves
     if robots and state.t_ns is not None:
-        moves.advance(state, *robots)
+        moves.advance(state, *robots)  # a gap that it notices goes on: the robot's next report has it
         blocks = _blocks(state.map, state.tracks, names)
     d2, start = factor.as_block(blocks, state.map.covariance([block.slot for block in blocks if block.dof]))
-    limit = math.inf if share == 1.0 else gate_of(share, len(factor.y))
+    limit = gate_of(share, len(factor.y))
     if d2 > limit:
         return Observation(0, None, "rejected", names[0], d2, f"outside the gate of {limit:.2f}")
-    moving = state.moving[robots[0] if robots else next(iter(state.robots))]
+    moving = state.moving[next(iter([*robots, *state.robots]))]
     y = start.mean + factor.residual(factor.y, start.mean)
     at = state.map.mean(moving.slot)[: 3 if moving.motion.space.axes == 1 else 7]
     done = state.corrected_by([start], update_by_blocks(moving.slot, -1, at, y[None], factor.R[None]))

@@ -449,7 +449,7 @@ class Slam(Estimate):
         >>> float(np.linalg.norm(slam.mean("door") - slam.mean("mast")).round(2))
         3.95
         """
-        done = correct_by_factor(self.state, names, factor_of(names, expect, y, cov, angular), gate)
+        done = correct_by_factor(self.state, factor_of(names, expect, y, cov, angular), gate)
         self.state.settle()
         return done
 
