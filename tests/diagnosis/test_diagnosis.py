@@ -815,6 +815,26 @@ def test_bearings_alone_accuse_no_odometry() -> None:
     assert not km.diagnose(recorded_under(config, log)).causes
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_bearings_alone_on_a_circle_accuse_no_mount(seed: int) -> None:
+    world = load_world("camera", ["steps=100"])
+    log = simulate(world, seed)
+    verdict = km.diagnose(recorded_under(world.config(), log))
+    assert (verdict.map, verdict.robots) == ("ok", {"robot": "ok"})
+    assert not [cause.name for cause in verdict.causes if not cause.harmless]
+
+
+def test_a_mount_that_is_elsewhere_leaves_the_map_ok_and_not_the_path() -> None:
+    run, verdict = (of(*FAULTS["mount_position"][:2]) for of in (run_of, verdict_on))
+    summary = run.evaluate()
+    assert (verdict.map, verdict.robots) == ("ok", {"rover": "doubtful"})
+    assert summary["robots"]["rover"]["pose_nees"] > 20 and summary["landmark_rmse_m"] < 0.15
+    told = next(verdict_lines(verdict.as_dict()))
+    assert told.startswith("the map is ok: ")
+    assert told.endswith("; but the path of rover is doubtful because of mount_position")
+    assert (verdict_on().map, verdict_on().robots) == ("ok", {"rover": "ok"})
+
+
 def test_a_gate_that_is_tight_makes_no_noise_too_large() -> None:
     """Innovations that are cut off at a gate of .9 have .74 of their variance."""
     run = run_of(settings=("filter.association={type: identity, gate: 0.9}",))

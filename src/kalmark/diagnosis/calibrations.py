@@ -16,8 +16,8 @@ from kalmark.batch.problem import sightings
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
 from kalmark.diagnosis.cause_search import LEAST_GAIN
-from kalmark.diagnosis.causes import MOST_SCALE, Finding
-from kalmark.diagnosis.error_columns import Column, columns_of, rates_of
+from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.error_columns import MOST_SCALE, Column, columns_of, rates_of
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.tunable_keys import Keys, Path_
 from kalmark.models.observe import view_of
@@ -54,7 +54,7 @@ def calibrations(
     for k, (key, column) in enumerate(zip(names, columns, strict=True)):
         if key not in paths:
             continue
-        if key in sure or (_shows(s[k], sigma[k], level) and (column.unit or abs(s[k]) < MOST_SCALE)):
+        if key in sure or (_shows(s[k], sigma[k], level) and abs(s[k]) < column.most):
             chosen.append(k)
         elif _shows(*alone[k], level):
             alike[key] = f"the log does not tell it from other systematic errors (alone {alone[k][0]:+.3g})"

@@ -34,7 +34,6 @@ MOST_STEPS = 0.9  # share of steps without a jump
 FAR_STEPS, FAR_S = 3.0, 5.0  # no driving: farther than so many long steps, and than it drives in this time
 SELDOM = 1e-3
 MOST_RHO = 0.999
-MOST_SCALE = 0.25  # beyond it the problem is not linear
 ALIKE = 0.85  # of what another one explains: they are alike
 SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
 TIMES = "times"  # the unit of noise
@@ -93,7 +92,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
             continue
         s = float(g[k] / I[k])
         moves = 0.0 if Z[:, k].any() else np.abs(s * W[:, k]).reshape(n, -1)[:, : linear.state.d].max(initial=0.0)
-        if (not column.unit and abs(s) > MOST_SCALE) or moves > linear.step:
+        if abs(s) > column.most or moves > linear.step:
             continue  # no small error: the problem is not linear so far away
         parts = np.bincount(block, left.r[:, k] * (have.r - s * left.r[:, k]), minlength=BLOCKS)
         parts += np.bincount(motion, left.m[:, k] * (Q @ (have.m - s * left.m[:, k])), minlength=BLOCKS)
@@ -116,11 +115,11 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
 
 
 def joint_errors(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
-    """Return the systematic errors s (K,), all estimated at once, and their information (K, K); scales are small."""
+    """Return the systematic errors s (K,), all at once and within their limits, and their information (K, K)."""
     Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
     have, left = linear.residuals, linear.left(Z, W)
     I = Z.T @ left.r + W.T @ left.m
-    prior = np.diag([0.0 if c.unit else MOST_SCALE**-2 for c in columns])
+    prior = np.diag([c.most**-2 for c in columns])
     s = np.linalg.lstsq(I + prior, Z.T @ have.r + W.T @ have.m)[0]
     return np.asarray(s, dtype=np.float64), np.asarray(I, dtype=np.float64)
 

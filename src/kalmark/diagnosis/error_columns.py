@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
 from kalmark.results.measures import pose_error
 
+MOST_SCALE = 0.25  # beyond it the problem is not linear: of a scale, and of a mount's share of the way to what it sees
 SLOW_S = 1e-3  # least time between two poses
 LENGTHS = ("range", "distance")  # how columns of lengths begin
 ALL = "all sensors"
@@ -24,13 +26,17 @@ Where = tuple[str, str]
 
 
 class Column(NamedTuple):
-    """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,)."""
+    """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,).
+
+    Beyond `most` of it the problem is not linear.
+    """
 
     name: str
     of: tuple[str, ...]
     unit: str
     Z: Array
     W: Array
+    most: float = math.inf
 
     @property
     def group(self) -> tuple[str, ...]:
@@ -54,7 +60,7 @@ def errors_of_all_sensors(columns: list[Column]) -> list[Column]:
         found.setdefault((column.name, column.of[0]), []).append(column)
     return [
         Column(name, (robot, ALL, *dict.fromkeys(x for c in same for x in c.of[2:])), same[0].unit,
-               sum((c.Z for c in same), start=np.zeros_like(same[0].Z)), same[0].W)
+               sum((c.Z for c in same), start=np.zeros_like(same[0].Z)), same[0].W, same[0].most)
         for (name, robot), same in found.items() if len(same) > 1
     ]  # fmt: skip
 
@@ -67,44 +73,47 @@ def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates:
         names, p = sensors.get(factor.sensor, ()), factor.R.shape[1]
         if len(names) != p:
             continue
-        for name, of, unit, part in _of_sensor(factor, linear.state, names, rates):
+        for name, of, unit, most, part in _of_sensor(factor, linear.state, names, rates):
             parts = [np.zeros(other.R.shape[:2]) for other in factors]
             parts[f] = part
             have, Z = found.get((name, *of)), linear.whitened(parts)
-            found[name, *of] = Column(name, of, unit, Z if have is None else have.Z + Z, nothing)
+            found[name, *of] = Column(name, of, unit, Z if have is None else have.Z + Z, nothing, most)
     return [*found.values()]
 
 
 def _of_sensor(
     factor: Factor, state: BatchState, names: tuple[str, ...], rates: Array
-) -> Iterator[tuple[str, tuple[str, ...], str, Array]]:
-    """Yield the name, the place and the unit of each error of a sensor, and what it adds to its innovations (K, p)."""
+) -> Iterator[tuple[str, tuple[str, ...], str, float, Array]]:
+    """Yield the name, place, unit and limit of each error of a sensor, and what it adds to its innovations (K, p)."""
     z, E = factor.term.at(state)
     e, one = factor.y[:, : z.shape[1]] - z, np.ones_like(z)  # of a wall, not its ends
     longer = _longer(names, e)
     for c, name in enumerate(names):
         of, mine = (*factor.sensor, name), np.eye(len(names))[c]
         if name.startswith(LENGTHS) and name.endswith("_m"):
-            yield "range_scale", of, "", longer * mine
-            yield "range_offset", of, "m", one * mine
+            yield "range_scale", of, "", MOST_SCALE, longer * mine
+            yield "range_offset", of, "m", math.inf, one * mine
         elif name.endswith("_rad"):
             offset = "bearing_offset" if name == "normal_rad" else f"{name.removesuffix('_rad')}_offset"
-            yield offset, of, "rad", one * mine
+            yield offset, of, "rad", math.inf, one * mine
         elif longer[:, c].any() and not longer[:, :c].any():  # one scale of all columns
             scaled = [other for k, other in enumerate(names) if longer[:, k].any()]
-            yield "range_scale", (*factor.sensor, *scaled), "", longer
+            yield "range_scale", (*factor.sensor, *scaled), "", MOST_SCALE, longer
     moving, first = np.zeros_like(z), 0
     for block in factor.term.blocks:
         dof = block.space.dof
         if block.group == POSES:
             moving += np.einsum("kij,kj->ki", E[:, :, first : first + dof], rates[block.rows, :dof])
         first += dof
-    yield "time_offset", factor.sensor, "s", moving
-    observer, d = factor.term.blocks[0], state.d
+    yield "time_offset", factor.sensor, "s", math.inf, moving
+    (observer, *_, seen), d = factor.term.blocks, state.d
     if observer.group == POSES:
-        axes = _axes(state.groups[POSES][observer.rows])
+        poses = state.groups[POSES][observer.rows]
+        axes, away = _axes(poses), state.groups[seen.group][seen.rows, :d] - poses[:, :d]
+        most = MOST_SCALE * float(np.median(np.linalg.norm(away, axis=1)))
+        shifted = np.einsum("kij,kjc->kic", E[:, :, :d], axes)
         for k, name in enumerate(("x_m", "y_m", "z_m")[:d]):
-            yield "mount_position", (*factor.sensor, name), "m", np.einsum("kij,kj->ki", E[:, :, :d], axes[:, :, k])
+            yield "mount_position", (*factor.sensor, name), "m", most, shifted[:, :, k]
 
 
 def _axes(poses: Array) -> Array:
@@ -141,7 +150,8 @@ def _of_controls(linear: Linear) -> Iterator[Column]:
         W = motions.systematic[:, k]
         if error.kind == "scale":
             W = W + linear.root @ np.where(kinds == f"{error.robot}.{error.column}", e, 0.0)
-        yield Column(name, (error.robot, error.column, error.kind), error.unit, nothing, W)
+        most = math.inf if error.unit else MOST_SCALE
+        yield Column(name, (error.robot, error.column, error.kind), error.unit, nothing, W, most)
 
 
 def rates_of(linear: Linear, t_ns: Ints) -> Array:

@@ -147,12 +147,19 @@ class _Sensor:
             change = partial(np.multiply, by)
         turned = None if change is None else change_measurements({self.where}, change)
         events = self.events if turned is None else [turned(e) for e in self.events]
+        scaled = by is not None and bool((np.abs(by) != 1.0).any())
         after = filtered_with(config, self.log, events)
+        return self.mistake(Mistake(name, "", "", config, turned), after, told, self.where if scaled else None)
+
+    def mistake(
+        self, without: Mistake, after: Filtered | None, told: Told, scaled: Where | None = None
+    ) -> Mistake | None:
+        """Return a mistake in words with its gain, None where the log `after` it was taken out does not fit."""
         if after is None or after.mean(self.where) > FITS:
             return None
-        scaled = by is not None and bool((np.abs(by) != 1.0).any())
-        gain = likelihood_gain(self.as_it_is, after, self.where if scaled else None)
-        return Mistake(name, *told(after), config, turned, gain) if gain > LEAST_GAIN else None
+        gain = likelihood_gain(self.as_it_is, after, scaled)
+        evidence, cure = told(after)
+        return without._replace(evidence=evidence, cure=cure, gain=gain) if gain > LEAST_GAIN else None
 
     # ------------------------------------------------------------------ each kind
     def noise(self) -> Mistake | None:
@@ -162,6 +169,8 @@ class _Sensor:
             for k in dict.fromkeys(self.sensor.sigmas)
             if isinstance(configured_value(self.config, (*self.path, k)), float)
         ]
+        if not keys:
+            return None
         now, times, config = self.as_it_is, 1.0, self.config
         for _ in range(ROUNDS):
             mine = now.of(self.where)
@@ -180,7 +189,7 @@ class _Sensor:
                 break
         what = f"readings of {'.'.join(self.where)} fit if their noise is {figure(times, 2)} times as large as stated"
         cure = " ".join(self.cured(k, configured_value(config, (*self.path, k))) for k in keys)
-        return self.trial(SIGMA, config, lambda _: (what, cure)) if keys else None
+        return self.mistake(Mistake(SIGMA, "", "", config), now, lambda _: (what, cure))
 
     def constants(self) -> Iterator[Mistake | None]:
         """Yield that a constant of it is not as stated, or its mount: each as the filter finds it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import pdtrc
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.batch.batch_state import LANDMARKS
+from kalmark.batch.batch_state import LANDMARKS, POSES
 from kalmark.diagnosis import doubled_landmarks, repeated_events
 from kalmark.diagnosis.batch_search import MORE, WORST, Searched, misfits, search_causes
 from kalmark.diagnosis.blind import blind
@@ -34,7 +34,7 @@ from kalmark.results.control_gaps import RULED_OUT, controls_left_out, is_report
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import RelocatedRobot
-from kalmark.results.measures import rigid, rmse
+from kalmark.results.measures import Rigid, rigid, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict_text import INNOVATIONS, NO_BATCH, NO_LANDMARKS, NO_MAP
@@ -173,7 +173,10 @@ def _with_signs(run: Run, verdict: Verdict) -> Verdict:
     found, at_end = signs(run, run.summary), [*unchecked_ends(run)]
     misfit = (sign.status for _, sign in at_end if sign.status != UNCHECKED)
     status = worst_status(verdict.map, *(sign.status for sign in found), *misfit)
-    robots = {name: worst_status(status, *(s.status for of, s in at_end if of == name)) for name in run.history.robots}
+    robots = {
+        name: worst_status(status, verdict.robots.get(name, OK), *(s.status for of, s in at_end if of == name))
+        for name in run.history.robots
+    }
     if not {*run.landmarks.ids} - {*run.landmarks.exact}:
         status = worst_status(status, *robots.values())
     told = [s for s in (*found, *(s for _, s in at_end)) if worst_status(verdict.map, s.status) != verdict.map]
@@ -214,7 +217,7 @@ def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdic
     causes = _ordered(run, first, found, _found(run, log, first, found, effect))
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
-    return Verdict(status, tuple(causes), checked, *figures, search=found.search)
+    return Verdict(status, tuple(causes), checked, *figures, dict(effect.robots), found.search)
 
 
 def _found(run: Run, log: Log, first: list[Cause], found: Searched, effect: Effect) -> list[Cause]:
@@ -642,6 +645,8 @@ def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
 class Effect:
     """Effect of the causes on a map: as in `Verdict`; `claimed` is the filter's sigma over what the data allow.
 
+    `robots` has the status of the path of each robot, by the same measure.
+
     >>> Effect().status, Effect(sigma_factor=1.3).sigma_factor
     ('ok', 1.3)
     """
@@ -653,6 +658,7 @@ class Effect:
     shift_m: float | None = None
     claimed: float | None = None
     dof: int = 0
+    robots: Mapping[str, str] = field(default_factory=dict)
 
 
 def effect_of(run: Run, found: Searched) -> Effect:
@@ -669,18 +675,19 @@ def effect_of(run: Run, found: Searched) -> Effect:
         places = np.array([mapped[run.landmarks.ids[k]][0][:d] for k in mine])
     lines = np.array([run.landmarks.kinds[k] == "wall" for k in mine])
     angle = np.where(lines, found.batch.state.groups[LANDMARKS][its, -1], np.nan)
-    off, extent = _off(places, moved, angle), rmse(moved - moved.mean(axis=0))
-    by_steady = rmse(_off(places, steady, angle))  # of causes that are sure: no noise explains it
+    onto, extent = rigid(places, moved), rmse(moved - moved.mean(axis=0))
+    robots = dict(_paths(run, found, onto, extent)) if len(rows) > d and not found.pulled else {}
+    off, by_steady = _off(onto, places, moved, angle), rmse(_off(rigid(places, steady), places, steady, angle))
     P = np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine])
     (stated, bare_stated), (honest, bare_honest) = (_sigmas(each, places, its, ~lines) for each in (first, cured))
     filtered = _sigma(P)
     shift_m = float(np.sqrt(max(rmse(off) ** 2 - rmse(honest[:, None]) ** 2, 0.0)))
-    share, free = shift_m / max(extent, TINY_M), (filtered > 0) & (stated > 0)
+    free = (filtered > 0) & (stated > 0)
     if not free.any():
-        return Effect(shift_m=shift_m)
-    off_it = share > LEAST and shift_m > SIGMAS * float(np.median(filtered[free]))
-    status = OK if not off_it else DOUBTFUL if share < MOST_OFF else WRONG
-    shift_m = max(shift_m, by_steady)  # reported, but no alarm: under noise that is stated too small it is too much
+        return Effect(shift_m=shift_m, robots=robots)
+    status = _status(shift_m, extent, float(np.median(filtered[free])))
+    # of causes that are sure, which no noise explains: reported, but no alarm
+    shift_m = max(shift_m, by_steady)
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     same_data = not waited and not filter_only_sensors(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data
@@ -695,13 +702,34 @@ def effect_of(run: Run, found: Searched) -> Effect:
     larger = np.divide(bare_honest, bare_stated, out=np.ones(len(bare)), where=bare_stated > 0) * over
     shape_m = float(np.median(np.hypot(larger * bare, shift_m)[free]))
     return Effect(
-        status, float(np.median(factors)), accuracy_m, shape_m, shift_m, claimed, d * int(free.sum())
+        status, float(np.median(factors)), accuracy_m, shape_m, shift_m, claimed, d * int(free.sum()), robots
     )  # fmt: skip
 
 
-def _off(places: Array, moved: Array, angle: Array) -> Array:
+def _status(off_m: float, extent_m: float, sigma_m: float) -> str:
+    """Return the status of a map or a path of this sigma that is off by so much, in a map of this extent."""
+    share = off_m / max(extent_m, TINY_M)
+    if share <= LEAST or off_m <= SIGMAS * sigma_m:
+        return OK
+    return DOUBTFUL if share < MOST_OFF else WRONG
+
+
+def _paths(run: Run, found: Searched, onto: Rigid, extent_m: float) -> Iterator[tuple[str, str]]:
+    """Yield the status of the path of each robot, `onto` being the motion of the map when the causes are taken out.
+
+    A mount that is not where it is stated bends no map, but each pose of its robot is off.
+    """
+    d, nodes, end = found.batch.state.d, found.search.linear.problem.nodes, run.history.map_at(len(run.history.t_ns))
+    path, moved = (s.groups[POSES][nodes, :d] for s in (found.batch.state, found.search.linear.moved()))
+    off = onto(path) - moved
+    for start, sigma_m in zip(run.history.starts, _sigma(end.robots).tolist(), strict=True):
+        mine = found.given.robot == start.robot
+        if mine.any():
+            yield start.robot, _status(rmse(off[mine]), extent_m, sigma_m)
+
+
+def _off(onto: Rigid, places: Array, moved: Array, angle: Array) -> Array:
     """Return by what (K, d) landmarks move beyond a rigid motion of all; lines with normals at an `angle` across."""
-    onto = rigid(places, moved)
     off = onto(places) - moved
     lines = np.isfinite(angle)
     if lines.any():

@@ -42,11 +42,11 @@ def overall(verdict: Mapping[str, Any]) -> str:
 
 def _first(verdict: Mapping[str, Any]) -> str:
     """Return the summary line: the status of the map, or the path, its cause, and its accuracy."""
-    harmful = [cause["name"] for cause in verdict["causes"] if not cause["harmless"]]
-    why = f" because of {harmful[0]}" if harmful and verdict["map"] not in (OK, UNCHECKED) else ""
-    why = ": the log does not check it" if verdict["map"] == UNCHECKED else why
+    harmful = next((f" because of {cause['name']}" for cause in verdict["causes"] if not cause["harmless"]), "")
+    why = ": the log does not check it" if verdict["map"] == UNCHECKED else harmful * (verdict["map"] != OK)
     what = "path" if str(verdict["checked"]).endswith((NO_MAP, NO_LANDMARKS)) else "map"
-    paths = [f"the path of {of} is {status}" for of, status in _worse(verdict)]
+    because = harmful * (verdict["map"] == OK)
+    paths = [f"the path of {of} is {status}{because if status != UNCHECKED else ''}" for of, status in _worse(verdict)]
     return "; but ".join([f"the {what} is {verdict['map']}{why}{_trust(verdict)}", *[", ".join(paths)] * bool(paths)])
 
 
