@@ -13,6 +13,7 @@ from kalmark.errors import LogError
 from kalmark.events import Scan
 from kalmark.logs import open_log
 from kalmark.logs.source import records_of, spelling_hint
+from kalmark.logs.table_columns import in_unit_of
 from native_logs import GOOD, HEAD, SCANS, native
 
 BAD_ROWS = {
@@ -128,6 +129,26 @@ def test_a_column_in_another_unit_or_in_none_is_refused_with_the_one_expected(
 def test_a_hint_at_a_column_has_the_unit_of_the_word(word: str, meant: str) -> None:
     assert spelling_hint(word, ("t_s", "robot", "v_mps", "w_radps")) == f"; did you mean {meant!r}?"
     assert spelling_hint("omega_degps", ("t_s", "v_mps")) == ""
+
+
+@pytest.mark.parametrize("word", ["time", "timestamp", "Stamp"])
+def test_a_time_without_a_unit_is_refused_with_a_hint_at_the_column(word: str, tmp_path: Path) -> None:
+    path = native(tmp_path, scans=SCANS.replace("t_s", word, 1)) / "scans.csv"
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    expected = "t_s, robot, sensor, id; did you mean 't_s'?"
+    assert str(refused.value) == f"{path}:1: column {word!r} is unknown, expected {expected}"
+
+
+@pytest.mark.parametrize(
+    ("word", "column", "meant"),
+    [
+        ("omega", "w_radps", "w_radps"), ("omega_degps", "w_radps", "w_degps"), ("speed", "v_mps", "v_mps"),
+        ("distance_cm", "range_m", "range_cm"), ("type", "t_s", ""), ("weight", "w_radps", ""), ("yaw", "y_m", ""),
+    ],
+)  # fmt: skip
+def test_a_word_of_the_field_means_its_column_and_no_other_does(word: str, column: str, meant: str) -> None:
+    assert in_unit_of(word, column) == meant
 
 
 def test_columns_of_ones_own_sensor_are_read_whatever_they_are_called(tmp_path: Path) -> None:

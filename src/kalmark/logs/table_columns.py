@@ -57,6 +57,11 @@ TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
 BASES = {unit: unit for unit in UNITS} | {unit: base for unit, (base, _) in FACTORS.items()}
 BASES |= {name.removeprefix("t_"): "s" for name in TIMES}
 """The unit that each unit that is taken becomes."""
+WORDS = {
+    "time": "t", "timestamp": "t", "stamp": "t", "velocity": "v", "speed": "v", "omega": "w", "yaw_rate": "w",
+    "yaw": "theta", "heading": "theta", "distance": "range", "dist": "range", "angle": "bearing",
+}  # fmt: skip
+"""Words of the field for quantities, and the stem of the column of each."""
 DIRECTIONS = ("bearing_rad", "azimuth_rad", "elevation_rad", "normal_rad")
 """The columns of directions, which are within a turn."""
 GLOBE = {"lat_deg": "x_m", "lon_deg": "y_m", "height_m": "z_m"}
@@ -74,7 +79,13 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def in_unit_of(name: str, column: str) -> str:
-    """Return a column in the unit of a name of the same quantity that begins alike, or "": t_ms of time_ms and t_s."""
+    """Return a column in the unit of a name of the same quantity, or "": t_ms of time_ms and t_s, t_s of time.
+
+    A name with a unit must begin alike or be one of `WORDS`, one without a unit must be one of `WORDS`.
+    """
     (stem, unit), (known, base) = split_unit(name), split_unit(column)
+    stem = WORDS.get(stem, stem)
+    if not unit:
+        return column if stem == known else ""
     alike = bool(stem and known) and (stem.startswith(known) or known.startswith(stem))
     return f"{known}_{unit}" if alike and base and BASES.get(unit) == BASES.get(base) else ""
