@@ -76,6 +76,13 @@ class ConstantVelocity(MotionModel, CompiledVelocity):
     The state is pose and velocity in the robot's frame, (x, y, theta, vx, vy, w); it moves on an arc.  The robot coasts
     to the time of each event.  A control is an impulse u = (dvx, dvy, dw) in its frame, at its time, with sigmas
     `sigma_v_mps`, `sigma_w_radps`; `..._per_sqrt_s` are white accelerations.
+
+    >>> robot = km.Robot("cart", km.motion.ConstantVelocity(), start=(0.0, 0.0, 0.0, 1.0, 0.2, 0.0))
+    >>> slam = km.Slam(robot)
+    >>> for t in (0.0, 2.0):
+    ...     report = slam.process(km.Control(t, "cart", (0.0, 0.0, 0.0)))
+    >>> slam.mean("cart")[:3].round(2)
+    array([2. , 0.4, 0. ])
     """
 
     sigma_v_mps: Annotated[NotNegative, "Error of the change of velocity that a control is, on each axis."] = 0.01
@@ -111,6 +118,13 @@ class ConstantTurnRate(MotionModel, CompiledVelocity):
     The state is (x, y, theta, v, w); it moves on an arc (the CTRV model of tracking).  The robot coasts to the time of
     each event.  A control is an impulse u = (dv, dw) at its time, with sigmas `sigma_v_mps`, `sigma_w_radps`;
     `..._per_sqrt_s` are white accelerations.
+
+    >>> robot = km.Robot("boat", km.motion.ConstantTurnRate(), start=(0.0, 0.0, 0.0, 1.0, 0.1))
+    >>> slam = km.Slam(robot)
+    >>> for t in (0.0, 2.0):
+    ...     report = slam.process(km.Control(t, "boat", (0.0, 0.0)))
+    >>> slam.mean("boat").round(2)
+    array([1.99, 0.2 , 0.2 , 1.  , 0.1 ])
     """
 
     sigma_v_mps: Annotated[NotNegative, "Error of the change of speed that a control is."] = 0.01

@@ -80,6 +80,13 @@ class RangeRate2D(_Doppler):
     """Rate of the range of a landmark that stands still.
 
     It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
+
+    >>> own = km.Mount(km.sensors.RangeRate2D())
+    >>> start, motion = (0.0, 0.0, 0.0, 1.0, 0.0), km.motion.ConstantTurnRate()
+    >>> slam = km.Slam(km.Robot("rover", motion, start=start, sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(4.0, 3.0), cov=0.01 * np.eye(2))
+    >>> slam.expect("rover", "own").e.round(2)
+    array([[-0.8]])
     """
 
     world: ClassVar[str] = "plane"
@@ -91,6 +98,14 @@ class RangeRate3D(_Doppler):
     """Rate of the range of a landmark that stands still.
 
     It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
+
+    >>> own = km.Mount(km.sensors.RangeRate3D())
+    >>> start = (*[0.0] * 6, 1.0, 1.0, *[0.0] * 5)  # at 1 m/s ahead
+    >>> motion = km.motion.ConstantVelocity3D()
+    >>> slam = km.Slam(km.Robot("drone", motion, start=start, sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(4.0, 3.0, 0.0), cov=0.01 * np.eye(3))
+    >>> slam.expect("drone", "own").e.round(2)
+    array([[-0.8]])
     """
 
     world: ClassVar[str] = "space"
@@ -102,6 +117,13 @@ class Radar2D(_Doppler):
     """A radar: range, bearing and range rate of a landmark that stands still.
 
     Where the robot has no velocity in its state it is the mean since the last scan.
+
+    >>> own = km.Mount(km.sensors.Radar2D())
+    >>> start, motion = (0.0, 0.0, 0.0, 1.0, 0.0), km.motion.ConstantTurnRate()
+    >>> slam = km.Slam(km.Robot("rover", motion, start=start, sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(4.0, 3.0), cov=0.01 * np.eye(2))
+    >>> slam.expect("rover", "own").e.round(2)
+    array([[ 5.  ,  0.64, -0.8 ]])
     """
 
     sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
@@ -127,6 +149,14 @@ class Radar3D(_Doppler):
     """A radar: range, azimuth, elevation and range rate of a landmark that stands still.
 
     Where the robot has no velocity in its state it is the mean since the last scan.
+
+    >>> own = km.Mount(km.sensors.Radar3D())
+    >>> start = (*[0.0] * 6, 1.0, 1.0, *[0.0] * 5)  # at 1 m/s ahead
+    >>> motion = km.motion.ConstantVelocity3D()
+    >>> slam = km.Slam(km.Robot("drone", motion, start=start, sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(4.0, 3.0, 0.0), cov=0.01 * np.eye(3))
+    >>> slam.expect("drone", "own").e.round(2)
+    array([[ 5.  ,  0.64,  0.  , -0.8 ]])
     """
 
     sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2

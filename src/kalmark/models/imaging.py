@@ -132,6 +132,12 @@ class PixelDepth(_Lens):
 
     Structured light and stereo measure a disparity, proportional to 1 / z: its noise is the same at any depth, that of
     the depth is sigma_rho z^2.  Khoshelham and Elberink 2012 (Kinect): 1.4e-3 / m.
+
+    >>> eye = km.Mount(km.sensors.PixelDepth(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[320.0, 240.0, 0.25]], ids=[7]))
+    >>> slam.mean(7).round(2)
+    array([4., 0., 0.])
     """
 
     sigma_rho_per_m: Annotated[Positive, "Noise of the inverse depth: that of a depth z is sigma_rho z^2."] = 0.003
@@ -160,6 +166,12 @@ class Omnidirectional(_Camera):
     """Scaramuzza's camera with a wide view that measures points: pixels u, v.
 
     `cameras.project_omni` explains the polynomials.  [TB] omniCam.
+
+    >>> eye = km.Mount(km.sensors.Omnidirectional(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> slam.add_landmark(7, mean=(4.0, 1.0, 0.5), cov=0.01 * np.eye(3))
+    >>> slam.expect("drone", "eye").e.round(1)
+    array([[577.9, 369. ]])
     """
 
     cx_px: Annotated[Number, "Centre of the image, from the left."] = 640.0
@@ -195,7 +207,14 @@ class Omnidirectional(_Camera):
 
 @register("sensor", "stereo")
 class Stereo(_PinHole):
-    """A rectified pair of cameras that measures points: u, v in the left image and u, v in the right one."""
+    """A rectified pair of cameras that measures points: u, v in the left image and u, v in the right one.
+
+    >>> eye = km.Mount(km.sensors.Stereo(baseline_m=0.2), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[320.0, 240.0, 304.0, 240.0]], ids=[7]))
+    >>> slam.mean(7).round(2)  # f baseline / disparity = 4 m
+    array([4., 0., 0.])
+    """
 
     baseline_m: Annotated[Positive, "Distance of the right camera from the left one, whose frame is the sensor's."] = (
         0.2
@@ -243,6 +262,12 @@ class Segments(_PinHole):
 
     So only the distances of the measured ends from the expected line count.  [TB] Fig. 9: the innovation is two
     distances, `ortDst`.
+
+    >>> eye = km.Mount(km.sensors.Segments(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[100.0, 200.0, 500.0, 300.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind
+    'anchored_homogeneous_line'
     """
 
     sigma_px: Annotated[Positive, "Noise of each pixel coordinate of an end."] = 1.0
@@ -293,6 +318,13 @@ class TagCorners(_Lens):
     """A camera that measures square tags of known size: pixels of their four corners.
 
     Corners in the tag's frame: (-s, -s), (s, -s), (s, s), (-s, s), s half the size.
+
+    >>> eye = km.Mount(km.sensors.TagCorners(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> corners = [300.0, 260.0, 340.0, 260.0, 340.0, 220.0, 300.0, 220.0]
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[*corners, 0.5]], ids=[7]))
+    >>> slam.mean(7)[:3].round(2)  # f size / 40 px = 4 m
+    array([4., 0., 0.])
     """
 
     expected: ClassVar[Any] = landmark_views.tag_corners

@@ -159,6 +159,13 @@ class Inertial(MotionModel):
     velocity in the world, and the biases of both, 16 numbers and 15 errors; z of the world is up.  The parameters are
     those of Kalibr's `imu.yaml`, of which a configuration can name one: `data_sheet`.  The noise of each reading is
     white, so a held reading that a scan divides has none in common with itself.
+
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Inertial()))
+    >>> u = (0.0, 0.0, 0.0, 0.5, 0.0, 9.80665)  # accelerates ahead
+    >>> for t in np.arange(0.0, 2.01, 0.01):
+    ...     report = slam.process(km.Control(t, "drone", u))
+    >>> slam.mean("drone")[:3].round(2), slam.mean("drone")[7:10].round(2)  # a t^2 / 2, a t
+    (array([ 1.  ,  0.  , -0.01]), array([ 1.  ,  0.  , -0.01]))
     """
 
     gyroscope_noise_density_rad_per_sqrt_s: Annotated[NotNegative, "White noise of the rate, rad/s/sqrt(Hz)."] = 1.7e-4
@@ -222,6 +229,11 @@ class InertialGravity(Inertial):
     """An inertial unit in a map whose vertical is not known: the gravity is in the state, and is estimated.
 
     The state is that of `inertial` with the gravity in the world behind it, (3,) m/s^2, 19 numbers and 18 errors.
+
+    >>> slam = km.Slam(km.Robot("drone", km.motion.InertialGravity()))
+    >>> report = slam.process(km.Control(0.0, "drone", (0.0, 0.0, 0.0, 0.0, 0.0, 9.81)))
+    >>> slam.mean("drone").size, slam.covariance("drone").shape
+    (19, (18, 18))
     """
 
     space: ClassVar[Space] = Space("SE2(3) with biases and gravity", (*Inertial.space.kinds, OWN))
@@ -288,6 +300,11 @@ def noise_densities(t_s: Array, u: Array) -> tuple[float, float]:
 
     At `t_s` (N,).  A vehicle that shakes has more than the data sheet gives.  Of the spectrum above what a vehicle
     itself moves by, in bands, the least counts: a motor that hums has no part in it.  Zero of too few readings.
+
+    >>> t_s, rng = 0.01 * np.arange(20000), np.random.default_rng(0)
+    >>> u = rng.normal(size=(20000, 6)) * [*[0.02] * 3, *[0.1] * 3]  # density 0.1 times as large
+    >>> np.round(km.motion.noise_densities(t_s, u), 4)
+    array([0.002 , 0.0099])
     """
     rate = 1.0 / float(np.median(np.diff(t_s))) if len(t_s) > 2 * SPECTRUM else 0.0
     if rate < 4.0 * BAND_HZ:

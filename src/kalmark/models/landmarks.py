@@ -70,6 +70,12 @@ class PointSignature2D(Point2D):
     """A Euclidean point of the plane with a signature (x, y, s).
 
     [T]'s landmark, d = 3N + 3.
+
+    >>> own = km.Mount(km.sensors.RangeBearingSignature())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[4.0, 0.0, 7.5]], ids=["tree"]))
+    >>> slam.landmark_model("tree").kind, slam.mean("tree").round(2)
+    ('point_signature', array([4. , 0. , 7.5]))
     """
 
     kind: ClassVar[str] = "point_signature"
@@ -81,6 +87,12 @@ class PointHeight2D(Point2D):
     """A surveyed point (x, y, z) at a height above the plane, in which the robot stays.
 
     Sensors of distances measure the way through space; others see its place in the plane.
+
+    >>> own = km.Mount(km.sensors.Range())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}))
+    >>> slam.add_landmark("beacon", mean=(4.0, 0.0, 3.0), cov=0.01 * np.eye(3), landmark=km.landmarks.PointHeight2D())
+    >>> slam.expect("rover", "own").e.round(2)
+    array([[5.]])
     """
 
     kind: ClassVar[str] = "point_height"
@@ -92,6 +104,12 @@ class Polar2D(_Landmark):
     """A point of the plane by anchor, direction and distance (4 numbers), for ranges with poor bearings.
 
     The errors are along an arc.  [S] 2.3.5.
+
+    >>> own = km.Mount(km.sensors.RangeBearing(), landmark=km.landmarks.Polar2D())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[4.0, 0.5]], ids=[7]))
+    >>> slam.mean(7).round(2)  # anchor, direction, distance
+    array([0. , 0. , 0.5, 4. ])
     """
 
     kind: ClassVar[str] = "polar"
@@ -115,6 +133,11 @@ class Wall2D(_Landmark):
     """A wall of the plane: a line with the segment that has been observed of it (3 numbers).
 
     A point on the line and the direction of its normal.  docs/walls.md.
+
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle()))
+    >>> slam.add_landmark("wall", mean=(4.0, 0.0, np.pi), cov=0.01 * np.eye(3), landmark=km.landmarks.Wall2D())
+    >>> slam.landmark_model("wall").kind, slam.mean("wall").round(2)
+    ('wall', array([4.  , 0.  , 3.14]))
     """
 
     join_m: Annotated[
@@ -143,7 +166,13 @@ class Wall2D(_Landmark):
 
 @register("landmark", "point")
 class Point3D(_Landmark):
-    """A Euclidean point (x, y, z) of space."""
+    """A Euclidean point (x, y, z) of space.
+
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D()))
+    >>> slam.add_landmark("tree", mean=(4.0, 1.0, 0.5), cov=0.01 * np.eye(3), landmark=km.landmarks.Point3D())
+    >>> slam.mean("tree"), slam.landmark_model("tree").kind
+    (array([4. , 1. , 0.5]), 'point3')
+    """
 
     kind: ClassVar[str] = "point3"
     space: ClassVar[Space] = spaces.POINT3
@@ -249,6 +278,13 @@ class InverseDepth3D(_BecomesPoint):
     """A point of space by anchor, direction and inverse distance (6 numbers).
 
     [TB] idpPnt; Civera, Davison, Montiel 2008.
+
+    >>> eye = km.Mount(km.sensors.PinHole(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.InverseDepth3D())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[330.0, 240.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('inverse_depth', 6)
     """
 
     kind: ClassVar[str] = "inverse_depth"
@@ -265,6 +301,13 @@ class AnchoredHomogeneous(_BecomesPoint):
     """A point of space by anchor, ray and inverse distance (7 numbers).
 
     [TB] ahmPnt; Sola 2012.
+
+    >>> eye = km.Mount(km.sensors.PinHole(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.AnchoredHomogeneous())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[330.0, 240.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('anchored_homogeneous', 7)
     """
 
     kind: ClassVar[str] = "anchored_homogeneous"
@@ -281,6 +324,13 @@ class Homogeneous(_Depth):
     """A homogeneous point of space (4 numbers).
 
     (h, rho) is at h / rho.  [TB] hmgPnt.
+
+    >>> eye = km.Mount(km.sensors.PinHole(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.Homogeneous())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[330.0, 240.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('homogeneous', 4)
     """
 
     kind: ClassVar[str] = "homogeneous"
@@ -293,7 +343,15 @@ class Homogeneous(_Depth):
 
 @dataclass(frozen=True)
 class AsPoint:
-    """A point of unknown depth for a sensor that measures depth: its Euclidean point."""
+    """A point of unknown depth for a sensor that measures depth: its Euclidean point.
+
+    >>> eye = km.Mount(km.sensors.PixelDepth(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.InverseDepth3D())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[320.0, 240.0, 0.25]], ids=[7]))
+    >>> slam.landmark_model(7).kind
+    'inverse_depth'
+    """
 
     ray: Any
 
@@ -328,6 +386,13 @@ class Tag(_Landmark):
     """A square tag: its pose.
 
     l = (x, y, z, qx, qy, qz, qw), the tag in its plane z = 0.  Its size is part of the measurement.
+
+    >>> eye = km.Mount(km.sensors.TagCorners(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> y = [300.0, 260.0, 340.0, 260.0, 340.0, 220.0, 300.0, 220.0, 0.5]
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [y], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('tag', 7)
     """
 
     kind: ClassVar[str] = "tag"
@@ -450,6 +515,13 @@ class PlueckerLine(_DirectionPrior):
     """A line by moment and direction (6 numbers).
 
     [TB] plkLin.
+
+    >>> eye = km.Mount(km.sensors.Segments(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.PlueckerLine())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[100.0, 200.0, 500.0, 300.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('pluecker_line', 6)
     """
 
     kind: ClassVar[str] = "pluecker_line"
@@ -465,6 +537,13 @@ class AnchoredPlueckerLine(_DirectionPrior):
     """A line by anchor, moment about it and direction (9 numbers).
 
     [TB] aplLin.
+
+    >>> eye = km.Mount(km.sensors.Segments(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.AnchoredPlueckerLine())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[100.0, 200.0, 500.0, 300.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('anchored_pluecker_line', 9)
     """
 
     kind: ClassVar[str] = "anchored_pluecker_line"
@@ -479,6 +558,13 @@ class InverseDepthLine(_DepthsPrior):
     """A line by anchor and azimuth, elevation and inverse distance of two points (9 numbers).
 
     [TB] idpLin.
+
+    >>> eye = km.Mount(km.sensors.Segments(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.InverseDepthLine())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[100.0, 200.0, 500.0, 300.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('inverse_depth_line', 9)
     """
 
     kind: ClassVar[str] = "inverse_depth_line"
@@ -492,6 +578,13 @@ class AnchoredHomogeneousLine(_DepthsPrior):
     """A line by anchor and ray and inverse distance of two points (11 numbers).
 
     [TB] ahmLin.
+
+    >>> eye = km.Mount(km.sensors.Segments(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.AnchoredHomogeneousLine())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[100.0, 200.0, 500.0, 300.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('anchored_homogeneous_line', 11)
     """
 
     kind: ClassVar[str] = "anchored_homogeneous_line"
@@ -505,6 +598,13 @@ class HomogeneousLine(_DepthsPrior):
     """A line by two homogeneous points (8 numbers).
 
     [TB] hmgLin.
+
+    >>> eye = km.Mount(km.sensors.Segments(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))
+    >>> robot = km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye})
+    >>> slam = km.Slam(robot, landmarks=km.landmarks.HomogeneousLine())
+    >>> report = slam.process(km.Scan(0.0, "drone", "eye", [[100.0, 200.0, 500.0, 300.0]], ids=[7]))
+    >>> slam.landmark_model(7).kind, slam.mean(7).size
+    ('homogeneous_line', 8)
     """
 
     kind: ClassVar[str] = "homogeneous_line"

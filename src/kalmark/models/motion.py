@@ -306,6 +306,13 @@ class ConstantVelocity3D(MotionModel, CompiledVelocity):
     The state is pose, velocity (world, m/s) and body rate (rad/s), 13 numbers and 12 errors.  The robot coasts to the
     time of each event.  A control is an impulse u = (dv (world), dw (body)) at its time, with sigmas `sigma_v_mps`,
     `sigma_w_radps`; `..._per_sqrt_s` are random walks of velocity and rate.
+
+    >>> start = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.5, 0.0, 0.0, 0.0)
+    >>> slam = km.Slam(km.Robot("drone", km.motion.ConstantVelocity3D(), start=start))
+    >>> for t in (0.0, 2.0):
+    ...     report = slam.process(km.Control(t, "drone", np.zeros(6)))
+    >>> slam.mean("drone")[:3].round(2)
+    array([2., 0., 1.])
     """
 
     sigma_v_mps: Annotated[NotNegative, "Error of the change of velocity that a control is."] = 0.01

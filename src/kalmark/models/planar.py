@@ -283,7 +283,14 @@ class Range(_Range, Raised):
 
 @register("sensor", "range")
 class Range3D(_Range):
-    """Distance to a landmark: a radio beacon, a sonar with a wide lobe."""
+    """Distance to a landmark: a radio beacon, a sonar with a wide lobe.
+
+    >>> own = km.Mount(km.sensors.Range3D(sigma_range_m=0.1))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(4.0, 3.0, 12.0), cov=0.01 * np.eye(3))
+    >>> slam.expect("drone", "own").e.round(2)
+    array([[13.]])
+    """
 
     world: ClassVar[str] = "space"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
@@ -319,6 +326,12 @@ class RangeBearingSignature(_RangingBearing):
     """Distance, direction and signature of a landmark, a number that differs from landmark to landmark.
 
     [T] 3: a landmark is (x, y, s).
+
+    >>> own = km.Mount(km.sensors.RangeBearingSignature())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[4.0, 0.0, 7.5]], ids=["tree"]))
+    >>> slam.mean("tree").round(2)  # x, y, signature
+    array([4. , 0. , 7.5])
     """
 
     sigma_bearing_rad: BearingNoise = 0.02

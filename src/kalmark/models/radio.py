@@ -120,7 +120,14 @@ class _SignalStrength(_Receiver):
 
 @register("sensor", "signal_strength")
 class SignalStrength2D(_SignalStrength, Raised):
-    """Received signal strength of a landmark that sends, by the log-distance path loss."""
+    """Received signal strength of a landmark that sends, by the log-distance path loss.
+
+    >>> own = km.Mount(km.sensors.SignalStrength2D(strength_dbm=-40.0, exponent=2.0))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(10.0, 0.0), cov=0.01 * np.eye(2))
+    >>> slam.expect("rover", "own").e.round(2)
+    array([[-60.]])
+    """
 
     def distances(self, y: Array) -> Array:
         """Return the distances (K,) in the plane at which strengths y (K, 1) of landmarks at height 0 are expected."""
@@ -129,7 +136,14 @@ class SignalStrength2D(_SignalStrength, Raised):
 
 @register("sensor", "signal_strength")
 class SignalStrength3D(_SignalStrength):
-    """Received signal strength of a landmark that sends, by the log-distance path loss."""
+    """Received signal strength of a landmark that sends, by the log-distance path loss.
+
+    >>> own = km.Mount(km.sensors.SignalStrength3D(strength_dbm=-40.0, exponent=2.0))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(0.0, 0.0, 10.0), cov=0.01 * np.eye(3))
+    >>> slam.expect("drone", "own").e.round(2)
+    array([[-60.]])
+    """
 
     world: ClassVar[str] = "space"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
@@ -153,12 +167,26 @@ class _RangeDifference(_Receiver):
 
 @register("sensor", "range_difference")
 class RangeDifference2D(_RangeDifference, Raised):
-    """Time difference of arrival at two receivers, times the speed of light or sound: right less left."""
+    """Time difference of arrival at two receivers, times the speed of light or sound: right less left.
+
+    >>> own = km.Mount(km.sensors.RangeDifference2D(baseline_m=0.5))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(4.0, 3.0), cov=0.01 * np.eye(2))
+    >>> slam.expect("rover", "own").e.round(2)
+    array([[0.3]])
+    """
 
 
 @register("sensor", "range_difference")
 class RangeDifference3D(_RangeDifference):
-    """Time difference of arrival at two receivers, times the speed of light or sound: right less left."""
+    """Time difference of arrival at two receivers, times the speed of light or sound: right less left.
+
+    >>> own = km.Mount(km.sensors.RangeDifference3D(baseline_m=0.5))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}))
+    >>> slam.add_landmark("a", mean=(4.0, 3.0, 1.0), cov=0.01 * np.eye(3))
+    >>> slam.expect("drone", "own").e.round(2)
+    array([[0.29]])
+    """
 
     world: ClassVar[str] = "space"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)

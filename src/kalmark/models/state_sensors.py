@@ -385,7 +385,14 @@ class AbsolutePose2D(StateSensor):
 
 @register("sensor", "absolute_pose")
 class AbsolutePose3D(StateSensor):
-    """A pose in the map's frame: motion capture, another localisation."""
+    """A pose in the map's frame: motion capture, another localisation.
+
+    >>> own = km.Mount(km.sensors.AbsolutePose3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}, cov=np.eye(6)))
+    >>> report = slam.process(km.Scan(0.0, "drone", "own", [[2.0, 1.0, 0.5, 0.0, 0.0, 0.0, 1.0]]))
+    >>> slam.mean("drone")[:3].round(2)
+    array([2. , 1. , 0.5])
+    """
 
     sigma_m: Annotated[Positive, "Noise of each coordinate."] = 0.01
     sigma_rotation_rad: Annotated[Positive, "Noise of the rotation about each axis."] = 0.01
@@ -434,7 +441,14 @@ class Height(StateSensor):
 
 @register("sensor", "inclination")
 class Inclination(StateSensor):
-    """Roll and pitch of the sensor: an inclinometer, a vertical reference."""
+    """Roll and pitch of the sensor: an inclinometer, a vertical reference.
+
+    >>> own = km.Mount(km.sensors.Inclination())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}, cov=np.eye(6)))
+    >>> report = slam.process(km.Scan(0.0, "drone", "own", [[0.1, 0.0]]))
+    >>> slam.mean("drone")[3:].round(2)
+    array([0.05, 0.  , 0.  , 1.  ])
+    """
 
     sigma_rad: Annotated[Positive, "Noise of each angle."] = 0.01
 
@@ -447,7 +461,14 @@ class Inclination(StateSensor):
 
 @register("sensor", "gravity")
 class Gravity(StateSensor):
-    """An accelerometer where its robot does not accelerate: it measures g, upwards, in its own frame."""
+    """An accelerometer where its robot does not accelerate: it measures g, upwards, in its own frame.
+
+    >>> own = km.Mount(km.sensors.Gravity())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"own": own}, cov=np.eye(6)))
+    >>> report = slam.process(km.Scan(0.0, "drone", "own", [[0.0, 0.98, 9.76]]))
+    >>> slam.mean("drone")[3:].round(2)
+    array([0.05, 0.  , 0.  , 1.  ])
+    """
 
     sigma_mps2: Annotated[Positive, "Noise of each component, unmodelled accelerations included."] = 0.2
     _: KW_ONLY
@@ -496,7 +517,14 @@ class _Gyro(StateSensor):
 
 @register("sensor", "gyro")
 class Gyro2D(_Gyro):
-    """A gyroscope: the turn rate, with the bias of the sensor and its random walk."""
+    """A gyroscope: the turn rate, with the bias of the sensor and its random walk.
+
+    >>> own = km.Mount(km.sensors.Gyro2D())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.ConstantTurnRate(), sensors={"own": own}, cov=np.eye(5)))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[0.2]]))
+    >>> slam.mean("rover")[3:].round(2)
+    array([0. , 0.2])
+    """
 
     _: KW_ONLY
     bias_radps: Bias = 0.0
@@ -511,7 +539,14 @@ class Gyro2D(_Gyro):
 
 @register("sensor", "gyro")
 class Gyro3D(_Gyro):
-    """A gyroscope: the rates about the sensor's axes, with the biases of the sensor and their random walk."""
+    """A gyroscope: the rates about the sensor's axes, with the biases of the sensor and their random walk.
+
+    >>> own = km.Mount(km.sensors.Gyro3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.ConstantVelocity3D(), sensors={"own": own}, cov=np.eye(12)))
+    >>> report = slam.process(km.Scan(0.0, "drone", "own", [[0.0, 0.0, 0.2]]))
+    >>> slam.mean("drone")[10:].round(2)
+    array([0. , 0. , 0.2])
+    """
 
     _: KW_ONLY
     bias_x_radps: Bias = 0.0
@@ -566,7 +601,14 @@ class _Velocity(_Scaled):
 
 @register("sensor", "body_velocity")
 class BodyVelocity2D(_Velocity):
-    """The velocity in the sensor's frame: optical flow, a Doppler log, wheels that do not slip."""
+    """The velocity in the sensor's frame: optical flow, a Doppler log, wheels that do not slip.
+
+    >>> own = km.Mount(km.sensors.BodyVelocity2D())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.ConstantVelocity(), sensors={"own": own}, cov=np.eye(6)))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[0.5, 0.1]]))
+    >>> slam.mean("rover")[3:5].round(2)
+    array([0.5, 0.1])
+    """
 
     world: ClassVar[str] = "plane"
     columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps")
@@ -575,7 +617,14 @@ class BodyVelocity2D(_Velocity):
 
 @register("sensor", "body_velocity")
 class BodyVelocity3D(_Velocity):
-    """The velocity in the sensor's frame: a Doppler log, optical flow with a height."""
+    """The velocity in the sensor's frame: a Doppler log, optical flow with a height.
+
+    >>> own = km.Mount(km.sensors.BodyVelocity3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.ConstantVelocity3D(), sensors={"own": own}, cov=np.eye(12)))
+    >>> report = slam.process(km.Scan(0.0, "drone", "own", [[0.5, 0.1, 0.0]]))
+    >>> slam.mean("drone")[7:10].round(2)
+    array([0.5, 0.1, 0. ])
+    """
 
     world: ClassVar[str] = "space"
     columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps")
@@ -584,7 +633,14 @@ class BodyVelocity3D(_Velocity):
 
 @register("sensor", "speed")
 class Speed(_Velocity):
-    """The velocity along the sensor's x axis: wheel speeds."""
+    """The velocity along the sensor's x axis: wheel speeds.
+
+    >>> own = km.Mount(km.sensors.Speed())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.ConstantTurnRate(), sensors={"own": own}, cov=np.eye(5)))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[0.5]]))
+    >>> slam.mean("rover")[3:].round(2)
+    array([0.5, 0. ])
+    """
 
     columns: ClassVar[tuple[str, ...]] = ("v_mps",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",)
@@ -592,7 +648,16 @@ class Speed(_Velocity):
 
 @register("sensor", "ground_speed")
 class GroundSpeed(StateSensor):
-    """The speed in any direction, as GPS receivers measure it."""
+    """The speed in any direction, as GPS receivers measure it.
+
+    >>> own = km.Mount(km.sensors.GroundSpeed())
+    >>> start = (0.0, 0.0, 0.0, 1.0, 0.0)
+    >>> motion, cov = km.motion.ConstantTurnRate(), np.eye(5)
+    >>> slam = km.Slam(km.Robot("rover", motion, start=start, sensors={"own": own}, cov=cov))
+    >>> report = slam.process(km.Scan(0.0, "rover", "own", [[1.5]]))
+    >>> slam.mean("rover")[3:].round(2)
+    array([1.5, 0. ])
+    """
 
     sigma_mps: Annotated[Positive, "Noise of the speed."] = 0.1
 
@@ -660,7 +725,16 @@ class _Odometer(_Scaled):
 
 @register("sensor", "odometer")
 class Odometer2D(_Odometer):
-    """The motion of the sensor since its last reading, in its frame at that time: a second odometry, scan matching."""
+    """The motion of the sensor since its last reading, in its frame at that time: a second odometry, scan matching.
+
+    >>> own = km.Mount(km.sensors.Odometer2D())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"own": own}, cov=np.eye(3)))
+    >>> for t, y in enumerate([[0.0, 0.0, 0.0], [0.5, 0.0, 0.1]]):
+    ...     report = slam.process(km.Control(float(t), "rover", (0.4, 0.1)))
+    ...     report = slam.process(km.Scan(float(t), "rover", "own", [y]))
+    >>> slam.mean("rover").round(2)
+    array([0.5 , 0.02, 0.1 ])
+    """
 
     world: ClassVar[str] = "plane"
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
@@ -669,7 +743,15 @@ class Odometer2D(_Odometer):
 
 @register("sensor", "odometer")
 class Odometer3D(_Odometer):
-    """The motion of the sensor since its last reading, in its frame at that time; its turn is a rotation vector."""
+    """The motion of the sensor since its last reading, in its frame at that time; its turn is a rotation vector.
+
+    >>> own = km.Mount(km.sensors.Odometer3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.ConstantVelocity3D(), sensors={"own": own}, cov=np.eye(12)))
+    >>> for t, y in enumerate([np.zeros(6), [0.5, 0.0, 0.0, 0.0, 0.0, 0.1]]):
+    ...     report = slam.process(km.Scan(float(t), "drone", "own", [y]))
+    >>> slam.mean("drone")[:3].round(2)
+    array([0.5 , 0.02, 0.  ])
+    """
 
     world: ClassVar[str] = "space"
     columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")

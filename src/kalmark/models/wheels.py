@@ -303,6 +303,13 @@ class SlippingUnicycle(SpeedAndTurn):
     the tangent of the angle between course and heading.  It is a random walk while the robot moves (Le, Rye and
     Durrant-Whyte 1997), because slip is of the ground (a slope, soft soil) and lasts.  For slip that comes and goes
     from step to step `sigma_across_m_per_sqrt_s` of any motion of the plane is enough.
+
+    >>> robot = km.Robot("tractor", km.motion.SlippingUnicycle(), start=(0.0, 0.0, 0.0, 0.1))
+    >>> slam = km.Slam(robot)
+    >>> for t in (0.0, 2.0):
+    ...     report = slam.process(km.Control(t, "tractor", (1.0, 0.0)))
+    >>> slam.mean("tractor").round(2)  # x, y, theta, slip
+    array([2. , 0.2, 0. , 0.1])
     """
 
     sigma_slip_per_sqrt_s: Annotated[NotNegative, "Random walk of the slip, while it moves."] = 0.02
