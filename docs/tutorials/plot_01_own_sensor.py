@@ -96,3 +96,13 @@ from kalmark.models.model_check import check_model
 
 for finding in check_model(Tape(), np.random.default_rng(0)):
     print(finding)
+
+# %%
+# Try changing
+# ------------
+#
+# * A worse clock: ``np.diag([1.0, 0.02]) ** 2``. The sigmas of landmark 1 grow from 0.013 m and 0.025 m to 0.069 m
+#   and 0.033 m.
+# * A wrong inverse, in ``Tape.invert``: ``return 2 * y, ...``. The error of ``expect(invert(y)) = y`` and that of its
+#   Jacobian ``V_y`` are not zero any more.
+# * A bound of a field: ``Tape(sigma_m=-0.1)`` is refused with the name, the value and what is expected.

@@ -70,3 +70,10 @@ from kalmark.models.model_check import check_model
 for finding in check_model(TwoTracks(), np.random.default_rng(0)):
     print(finding)
 plt.show()
+
+# %%
+# Try changing
+# ------------
+#
+# A wrong Jacobian: ``return r, R_r, R_v``. The check shows an error of 0.9 of ``R_u``, and where: in its state, its
+# control and its interval.

@@ -31,6 +31,6 @@ for ax, (name, association) in zip(axes, choices.items(), strict=True):
     for row in landmarks:
         ax.plot(*km.geometry.ellipse(row.mean, row.covariance, sigmas=3, points=30).T, "C1")
     ax.plot(run.history.mean[:, 0], run.history.mean[:, 1])
-    ax.set(title=f"{name}: {len(landmarks)} landmarks", aspect="equal")
+    ax.set(title=f"{name}: {len(landmarks)} landmarks", aspect="equal", xlabel="x [m]", ylabel="y [m]")
     print(name, {key: told[key] for key in ("associated", "new", "deferred", "tentative", "ignored")})
 plt.show()

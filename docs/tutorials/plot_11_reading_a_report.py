@@ -55,3 +55,12 @@ print("expected of 7:", slam.expect("rover", "lidar", names=[7]).e.round(3))
 #
 # ``associations.csv`` in a run folder has a row for each observation of the log, ``kalmark explain RUN`` draws any
 # scan with its candidates (:doc:`/evaluation`).
+
+# %%
+# Try changing
+# ------------
+#
+# * A right measurement: ``[2.2, -0.5]`` in place of ``[3.5, -0.5]``. It is 0.2 m off, its d2 is 2, and it is
+#   associated.
+# * No ids in the second scan: ``[None] * 3``, with ``association=km.association.NearestNeighbour()`` in ``Slam``. The
+#   other two observations are *tentative*, each with its reason.

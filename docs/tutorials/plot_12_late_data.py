@@ -59,3 +59,12 @@ print(f"processed up to {slam.t_ns / 1e9:.1f} s of {t:.1f} s, {len(buffer.waitin
 #
 # A sensor that compares with an earlier pose (scan matching, a loop closure) needs no late event: an ``odometer``
 # with ``keep`` clones the poses of its last scans (:doc:`/state_sensors`).
+
+# %%
+# Try changing
+# ------------
+#
+# * A delay that is too short: ``delay_s=0.1``. The first late scan is refused: it comes after a control of a later
+#   time.
+# * A longer one: ``delay_s=1.0``. Nothing is refused, but the estimate is a second old, and 18 events wait in place
+#   of 4.

@@ -52,7 +52,7 @@ for robot in robots:
 # robots see, connect them: their corrections make the poses of A and B correlated.
 for row in slam.landmarks():
     ax.plot(*km.geometry.ellipse(row.mean, row.covariance, sigmas=3, points=60).T, "C2")
-    ax.annotate(f"landmark {row.id}", row.mean + 0.2)
+    ax.annotate(f"landmark {row.id}", row.mean + np.array([0.1, 0.5]))
 for robot in robots:
     r, P = slam.mean(robot.name), slam.covariance(robot.name)
     ax.plot(*r[:2], "k", marker=f"${robot.name}$", ms=10)

@@ -53,8 +53,8 @@ axes[0].set_ylabel("f(d) [rad]")
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 # Blue is what the function makes of the prior (the band is two sigmas), red what the filter takes for it: the same
 # line, nearly the same, and something else. The red curve is Gaussian; the true one is not.

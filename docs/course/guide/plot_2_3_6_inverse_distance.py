@@ -55,8 +55,8 @@ figure.supxlabel("baseline [m]")
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 # The band is two sigmas of the first run, the dashed line the truth; the title gives the share of the runs that end
 # within three sigmas. The filter of :math:`\rho` is right at all three distances. The filter of :math:`d` is right

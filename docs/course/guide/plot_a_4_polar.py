@@ -35,7 +35,7 @@ print("the Jacobians are inverse:", (P_y @ Y_p).round(12) + 0.0, sep="\n")
 # A laser measures both numbers well, a sonar the bearing poorly, a camera no range. Measurements with their noise are
 # drawn as points of the plane. The ellipses are :math:`P_y\, \operatorname{diag}(\sigma^2)\, P_y^\top` at two sigmas.
 sensors = {"laser": (0.05, 0.01), "sonar": (0.05, 0.25), "camera": (1.5, 0.01)}
-figure, axes = plt.subplots(1, 3, figsize=(10, 4), layout="tight", sharex=True, sharey=True)
+figure, axes = plt.subplots(1, 3, figsize=(10, 4.4), layout="constrained", sharex=True, sharey=True)
 for ax, (name, sigmas) in zip(axes, sensors.items(), strict=True):
     draws, _, _ = km.geometry.inv_observe(r, y + sigmas * rng.normal(size=(500, 2)))
     ax.plot(*draws.T, ".", ms=3, alpha=0.4)

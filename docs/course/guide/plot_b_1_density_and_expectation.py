@@ -62,5 +62,5 @@ plt.show()
 #
 # * The variance: ``np.array([[2.0]])``. E[cos x] falls from 0.421 to 0.199: it is :math:`e^{-P/2} \cos \bar x`, a
 #   wide Gaussian averages the cosine away.
-# * The function: ``np.cos(x[0])`` to ``x[0] ** 3``. The expectation is :math:`\bar x^3 + 3 \bar x P` = 2.5, not
+# * The function: ``np.cos(x[0])`` to ``x[0] ** 3``. Under the old name it is :math:`\bar x^3 + 3 \bar x P` = 2.5, not
 #   :math:`\bar x^3` = 1: the expectation of a function is not the function of the expectation.

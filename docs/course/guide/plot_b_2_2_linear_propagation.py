@@ -45,8 +45,8 @@ axes[0].set_ylabel("y₂")
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 # The rotation keeps the semi-axes, the shear mixes the two numbers, and the projection makes the ellipse a line: then
 # :math:`Y` has no inverse, although :math:`P` has one.

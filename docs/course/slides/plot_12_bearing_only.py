@@ -58,8 +58,8 @@ for ax, (name, (distance, spread)) in zip(axes, priors.items(), strict=True):
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 # Orange is the ellipse of the start, at 2 sigma, blue the fifty estimates after six bearings; the title has the share
 # that is within 3 sigma of the truth. The narrower the prior, the better the filter; the wide one, which is nearer to

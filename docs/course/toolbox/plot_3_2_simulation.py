@@ -31,6 +31,7 @@ for k, (name, world) in enumerate(worlds.items()):
         ax.plot(*landmark.reshape(-1, 3).T, "k.-", ms=3, lw=1)
     ax.plot(*log.truth["robot"].poses[:, :3].T, "C0")
     ax.set(xlabel="x [m]", ylabel="y [m]", title=name, aspect="equal")
+    ax.locator_params(axis="z", nbins=1)
     image = figure.add_subplot(2, 2, k + 3, aspect="equal")
     raw = log.events[-1].y
     image.plot(*np.reshape(raw, (len(raw), -1, 2)).T, "C3.-", ms=4, lw=1)
@@ -38,8 +39,8 @@ for k, (name, world) in enumerate(worlds.items()):
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 # Above: ``SimLmk``, and the path of ``SimRob``. Below: ``SimObs``, the last frame of the camera, with a noise of one
 # pixel: points of the cloister, line segments of the house.

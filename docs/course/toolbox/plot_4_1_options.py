@@ -45,8 +45,8 @@ used.set(xlabel="corrections by a landmark")
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 #
 # One run does not rank settings; ``kalmark campaign`` compares many. Four landmarks of sixteen, well chosen, nearly

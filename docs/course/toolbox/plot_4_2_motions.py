@@ -46,8 +46,8 @@ except km.KalmarkError as error:
 plt.show()
 
 # %%
-# What the picture shows
-# ----------------------
+# The picture
+# -----------
 #
 # Dotted is the truth. Each control of the odometry adds its noise once, and the ellipses of 3 sigma grow slowly. The
 # noise of an impulse stays in the velocity, so the error of the position grows ever faster. The last line printed is

@@ -44,8 +44,8 @@ for ax, (name, camera) in zip(axes.flat, cameras.items(), strict=True):
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 # The ideal camera keeps lines straight and sees 147 of the 369 points. A distortion with :math:`d_1 < 0` bends lines
 # outwards and sees 183. The lens ``equidistant`` and the omnidirectional camera see the whole wall; the latter sees

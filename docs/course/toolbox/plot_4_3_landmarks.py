@@ -47,8 +47,8 @@ error.legend()
 plt.show()
 
 # %%
-# What the pictures show
-# ----------------------
+# The pictures
+# ------------
 #
 # The first two are the same function of nearly the same numbers, and their curves are one. The homogeneous point has no
 # anchor, and its sigma is larger and its NEES nearer to 6. :doc:`/bearing_only` says why it keeps the covariance
