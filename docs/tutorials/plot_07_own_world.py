@@ -54,7 +54,7 @@ ax.plot(truth[:, 0], truth[:, 1], "0.7", label="true path")
 ax.plot(run.history.mean[:, 0], run.history.mean[:, 1], label="estimate")
 for row in run.final_slam().landmarks():
     ax.plot(*km.geometry.ellipse(row.mean, row.covariance, sigmas=3, points=40).T, "C1")
-ax.set_aspect("equal")
+ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 ax.legend()
 plt.show()
 

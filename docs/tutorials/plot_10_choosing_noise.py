@@ -33,7 +33,7 @@ for sigma in (0.033, 0.1, 0.3):
     print(f"sigma {sigma:5} m: NIS {told['nis_per_dof']:.2f}, pose NEES {nees:.1f}")
 ax.axhline(1, color="0.5")
 ax.set(yscale="log", xlabel="observation", ylabel="NIS per degree of freedom")
-ax.legend(title="stated noise of the range", loc="center right")
+figure.legend(title="stated noise\nof the range", loc="outside right center")
 
 # %%
 # Move both noises

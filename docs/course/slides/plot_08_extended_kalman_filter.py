@@ -57,6 +57,7 @@ for i in range(120):
 # The band is 2 sigma. The rate is never measured. At the lowest point :math:`G_x` is zero, and the measurement tells
 # nothing; it is the motion that carries the estimate through.
 t, angle, rate, s_angle, s_rate, true_angle, true_rate = np.array(rows).T
+print(f"last sigmas: {s_angle[-1]:.3f} rad, {s_rate[-1]:.3f} rad/s")
 figure, axes = plt.subplots(2, 1, figsize=(8, 5), layout="constrained", sharex=True)
 shown = (angle, s_angle, true_angle), (rate, s_rate, true_rate)
 for ax, (x, s, truth) in zip(axes, shown, strict=True):
