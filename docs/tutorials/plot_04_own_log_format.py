@@ -58,3 +58,10 @@ log = km.open_log(file)
 print(log)
 rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
 print(km.record(km.Slam(rover), log, progress=False))
+
+# %%
+# Try changing
+# ------------
+#
+# An option: ``def read(path, request, step_s: Annotated[Positive, "Time of a step."] = 1.0)``, with ``t * step_s`` as
+# the times. ``km.open_log(file, step_s=2)`` then lasts 3 s, and ``step_s=-1`` is refused with one line.

@@ -34,3 +34,10 @@ for ax, (name, association) in zip(axes, choices.items(), strict=True):
     ax.set(title=f"{name}: {len(landmarks)} landmarks", aspect="equal", xlabel="x [m]", ylabel="y [m]")
     print(name, {key: told[key] for key in ("associated", "new", "deferred", "tentative", "ignored")})
 plt.show()
+
+# %%
+# Try changing
+# ------------
+#
+# Four times as many landmarks: ``"world.count=400"`` in the world. *auto* defers 663 observations until the scan
+# decides, ignores 272 in place of 732, and maps 185 landmarks in place of 179.

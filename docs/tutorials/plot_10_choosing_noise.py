@@ -60,3 +60,10 @@ plt.show()
 # ``sigma_v_mps`` is the error of a speed held over its interval, so its effect depends on the rate of the controls.
 # Noise stated as ``..._per_sqrt_s`` is a random walk and does not: use it where controls come at any rate.
 # :doc:`/presets` has the noise of common sensors with its sources.
+
+# %%
+# Try changing
+# ------------
+#
+# Only the noise of the range is wrong: ``sigma_bearing_rad=0.02`` in place of ``{sigma / 5}``. The three NIS are 4.69,
+# 0.97 and 0.54, and a range that is stated too noisy alone leaves the NEES at 2.8: the bearings carry the pose.

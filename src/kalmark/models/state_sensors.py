@@ -687,6 +687,9 @@ class ZeroVelocity2D(_ZeroVelocity):
     """Readings of zero velocity, made where the other sensors show that the robot stands.
 
     No rows in the log are needed; rows that there are, of a brake for example, are readings.  docs/state_sensors.md.
+
+    >>> km.sensors.ZeroVelocity2D().columns
+    ('vx_mps', 'vy_mps', 'w_radps')
     """
 
     world: ClassVar[str] = "plane"
@@ -699,6 +702,9 @@ class ZeroVelocity3D(_ZeroVelocity):
     """Readings of zero velocity, made where the other sensors show that the robot stands.
 
     No rows in the log are needed; rows that there are, of a brake for example, are readings.  docs/state_sensors.md.
+
+    >>> km.sensors.ZeroVelocity3D(sigma_mps=0.002).sigma_mps
+    0.002
     """
 
     world: ClassVar[str] = "space"
