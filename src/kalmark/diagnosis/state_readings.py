@@ -149,17 +149,14 @@ class _Sensor:
         events = self.events if turned is None else [turned(e) for e in self.events]
         scaled = by is not None and bool((np.abs(by) != 1.0).any())
         after = filtered_with(config, self.log, events)
-        return self.mistake(Mistake(name, "", "", config, turned), after, told, self.where if scaled else None)
-
-    def mistake(
-        self, without: Mistake, after: Filtered | None, told: Told, scaled: Where | None = None
-    ) -> Mistake | None:
-        """Return a mistake in words with its gain, None where the log `after` it was taken out does not fit."""
-        if after is None or after.mean(self.where) > FITS:
+        if after is None:
             return None
-        gain = likelihood_gain(self.as_it_is, after, scaled)
-        evidence, cure = told(after)
-        return without._replace(evidence=evidence, cure=cure, gain=gain) if gain > LEAST_GAIN else None
+        gain = self.gain(after, self.where if scaled else None)
+        return Mistake(name, *told(after), config, turned, gain) if gain > LEAST_GAIN else None
+
+    def gain(self, after: Filtered, scaled: Where | None = None) -> float:
+        """Return by how much likelier the log is in a second run; nothing where the readings do not fit in it."""
+        return likelihood_gain(self.as_it_is, after, scaled) if after.mean(self.where) <= FITS else -math.inf
 
     # ------------------------------------------------------------------ each kind
     def noise(self) -> Mistake | None:
@@ -189,7 +186,8 @@ class _Sensor:
                 break
         what = f"readings of {'.'.join(self.where)} fit if their noise is {figure(times, 2)} times as large as stated"
         cure = " ".join(self.cured(k, configured_value(config, (*self.path, k))) for k in keys)
-        return self.mistake(Mistake(SIGMA, "", "", config), now, lambda _: (what, cure))
+        gain = self.gain(now)
+        return Mistake(SIGMA, what, cure, config, gain=gain) if gain > LEAST_GAIN else None
 
     def constants(self) -> Iterator[Mistake | None]:
         """Yield that a constant of it is not as stated, or its mount: each as the filter finds it."""

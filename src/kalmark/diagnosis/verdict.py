@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -158,9 +158,8 @@ def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         return verdict
     of_it = (mistake.name, "kidnapped") if mistake.name in (LATE, MOVED) else ()
     rest = [c for c in verdict.causes if c.name not in of_it]
-    status = worst_status(
-        verdict.map, DOUBTFUL if of_it else OK
-    )  # of late scans nothing is of a landmark in turns: they vanish
+    # of late scans nothing is of a landmark in turns: they vanish
+    status = worst_status(verdict.map, DOUBTFUL if of_it else OK)
     return replace(verdict, map=status, causes=(_of_mistake(mistake), *rest))
 
 
@@ -217,7 +216,7 @@ def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdic
     causes = _ordered(run, first, found, _found(run, log, first, found, effect))
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
-    return Verdict(status, tuple(causes), checked, *figures, dict(effect.robots), found.search)
+    return Verdict(status, tuple(causes), checked, *figures, effect.robots, found.search)
 
 
 def _found(run: Run, log: Log, first: list[Cause], found: Searched, effect: Effect) -> list[Cause]:
@@ -658,7 +657,7 @@ class Effect:
     shift_m: float | None = None
     claimed: float | None = None
     dof: int = 0
-    robots: Mapping[str, str] = field(default_factory=dict)
+    robots: dict[str, str] = field(default_factory=dict)
 
 
 def effect_of(run: Run, found: Searched) -> Effect:
@@ -677,7 +676,8 @@ def effect_of(run: Run, found: Searched) -> Effect:
     angle = np.where(lines, found.batch.state.groups[LANDMARKS][its, -1], np.nan)
     onto, extent = rigid(places, moved), rmse(moved - moved.mean(axis=0))
     robots = dict(_paths(run, found, onto, extent)) if len(rows) > d and not found.pulled else {}
-    off, by_steady = _off(onto, places, moved, angle), rmse(_off(rigid(places, steady), places, steady, angle))
+    off = _off(onto, places, moved, angle)
+    by_steady = rmse(_off(rigid(places, steady), places, steady, angle))
     P = np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine])
     (stated, bare_stated), (honest, bare_honest) = (_sigmas(each, places, its, ~lines) for each in (first, cured))
     filtered = _sigma(P)
@@ -686,8 +686,7 @@ def effect_of(run: Run, found: Searched) -> Effect:
     if not free.any():
         return Effect(shift_m=shift_m, robots=robots)
     status = _status(shift_m, extent, float(np.median(filtered[free])))
-    # of causes that are sure, which no noise explains: reported, but no alarm
-    shift_m = max(shift_m, by_steady)
+    shift_m = max(shift_m, by_steady)  # of causes that are sure, which no noise explains: reported, but no alarm
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     same_data = not waited and not filter_only_sensors(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data
