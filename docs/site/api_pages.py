@@ -7,9 +7,9 @@ configuration follow from the declaration.
 import inspect
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
-from docstrings import rst, signature_of
+from docstrings import plain_names, rst, signature_of
 
 import kalmark as km
 from kalmark.declare import is_own, parameters, registered_name, world_of_class
@@ -95,6 +95,11 @@ def _page(shown: str, name: str, thing: Any) -> str:
     return f"kalmark.{name}" if name in dir(km) and getattr(km, name) is thing else f"{shown}.{name}"
 
 
+def is_code(thing: Any) -> bool:
+    """Return whether a name is that of a class or a function, not of a value or a type with bounds."""
+    return callable(thing) and get_origin(thing) is None
+
+
 def _head(title: str) -> str:
     return f"{title}\n{'=' * len(title)}\n"
 
@@ -146,14 +151,14 @@ def _group(thing: Any) -> str:
         return f"In the {world}" if world == "plane" else "In space"
     if isinstance(thing, type):
         return "Classes"
-    return "Functions" if callable(thing) else "Values"
+    return "Functions" if is_code(thing) else "Values"
 
 
 def _docstring(thing: Any) -> str:
     """Return the docstring, of a declared model without its parameters; of a value nothing."""
     if isinstance(thing, type):
         return inspect.cleandoc(getattr(vars(thing).get("__doc__"), "text", None) or thing.__doc__ or "")
-    return inspect.getdoc(thing) or "" if callable(thing) else ""
+    return inspect.getdoc(thing) or "" if is_code(thing) else ""
 
 
 def _summary(thing: Any) -> str:
@@ -170,10 +175,10 @@ def page_of_name(shown: str, name: str, thing: Any) -> str:
     ]
     if isinstance(thing, type):
         parts += _class(name, thing)
-    elif callable(thing):
+    elif is_code(thing):
         parts += [f".. py:function:: {name}{signature_of(thing)}", "", _indented(rst(_docstring(thing)))]
     else:
-        value = repr(thing)
+        value = plain_names(repr(thing))
         parts += [
             f".. py:data:: {name}",
             "",

@@ -27,7 +27,12 @@ def signature_of(thing: Any, method: bool = False) -> str:
         parameters=plain[1:] if method and plain and plain[0].name in ("self", "cls") else plain,
         return_annotation=Raw(returned) if isinstance(returned, str) else returned,
     )
-    return re.sub(r"typing\.|kalmark\.(\w+\.)+", "", str(told)).replace(" -> None", "")
+    return plain_names(str(told)).replace(" -> None", "")
+
+
+def plain_names(code: str) -> str:
+    """Return code in which types have no module before them."""
+    return re.sub(r"typing\.|kalmark\.(\w+\.)+", "", code)
 
 
 def _plain(one: inspect.Parameter) -> inspect.Parameter:

@@ -113,6 +113,9 @@ class Values:
     """The values of a mapping: models of a `role`, each with its `type`, or texts.
 
     A text with this `ending` is a file, which is looked for beside the configuration.
+
+    >>> Values(role="motion"), Values(ending=".csv")
+    (Values(role='motion', ending=''), Values(role='', ending='.csv'))
     """
 
     role: str = ""
@@ -121,7 +124,12 @@ class Values:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A field of a model, or an option: `type` is without None and without the `words` that it may be instead."""
+    """A field of a model, or an option: `type` is without None and without the `words` that it may be instead.
+
+    >>> one = parameters(km.sensors.Bearing)[0]
+    >>> one.name, one.default, one.unit, one.wanted
+    ('sigma_bearing_rad', 0.02, 'rad', 'a positive number')
+    """
 
     name: str
     type: Any
@@ -286,7 +294,14 @@ class _Documented:
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def declared(model: Class) -> Class:
-    """Make a class a frozen dataclass whose parameters are checked when one is made, and shown by `help`."""
+    """Make a class a frozen dataclass whose parameters are checked when one is made, and shown by `help`.
+
+    >>> class Budget:
+    ...     count: Count = 10
+    >>> Budget = declared(Budget)  # or above the class: @declared
+    >>> Budget(count=5)
+    Budget(count=5)
+    """
     if "__dataclass_params__" in vars(model):  # a user's, made one in another way
         return model
     after = next((vars(each)["__post_init__"] for each in model.__mro__ if "__post_init__" in vars(each)), None)
@@ -316,6 +331,12 @@ def register(role: str, name: str) -> Callable[[Class], Class]:
 
     `role` is "motion", "sensor", "landmark", "association", "estimator", "detector" or "initialization".  A name may
     stand for two classes, one of the plane and one of space.  Raises ModelError if kalmark has that name already.
+
+    >>> class Mine(km.sensors.RangeBearing):
+    ...     pass
+    >>> Mine = km.register("sensor", "my_lidar")(Mine)  # or above the class: @km.register("sensor", "my_lidar")
+    >>> Mine().columns
+    ('range_m', 'bearing_rad')
     """
 
     def registered(model: Class) -> Class:

@@ -373,6 +373,10 @@ class Raw(_Timed):
     """Raw data of one sensor of one robot at one instant, of which the detector of that sensor makes a scan.
 
     A frozen dataclass of its own for each kind of data: `Frame`, or one of a plug-in's.
+
+    >>> frame = km.Frame(t_s=0.5, robot="rover", sensor="camera", image=np.zeros((480, 640), np.uint8))
+    >>> isinstance(frame, Raw), frame.t_ns
+    (True, 500000000)
     """
 
     t_ns: int
@@ -487,6 +491,11 @@ def sort_key(event: Event) -> tuple[int, int, str, str]:
     """Sort key of events: time, then Control, Scan or raw data, Fix, then robot, then sensor.
 
     A stable sort keeps arrival.
+
+    >>> sort_key(km.Control(0.1, "rover", (0.5, 0.1)))
+    (100000000, 0, 'rover', '')
+    >>> sort_key(km.Scan(0.1, "rover", "lidar", [[4.0, 0.3]]))
+    (100000000, 1, 'rover', 'lidar')
     """
     return (
         event.t_ns,
@@ -497,7 +506,12 @@ def sort_key(event: Event) -> tuple[int, int, str, str]:
 
 
 def sort_events(events: list[Event]) -> list[Event]:
-    """Return events by `sort_key`: of a long log in the memory of a list, where keys take some 200 bytes an event."""
+    """Return events by `sort_key`: of a long log in the memory of a list, where keys take some 200 bytes an event.
+
+    >>> scan, control = km.Scan(0.1, "rover", "lidar", [[4.0, 0.3]]), km.Control(0.1, "rover", (0.5, 0.1))
+    >>> [type(event).__name__ for event in sort_events([scan, control])]
+    ['Control', 'Scan']
+    """
     t_ns = np.fromiter((event.t_ns for event in events), np.int64, len(events))
     by_time = (events[k] for k in np.argsort(t_ns, kind="stable"))
     out: list[Event] = []

@@ -53,7 +53,15 @@ class Observation(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """A landmark that observation `index` was compared with: its squared distance and its place in the map."""
+    """A landmark that observation `index` was compared with: its squared distance and its place in the map.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover, association=km.association.NearestNeighbour())
+    >>> slam.add_landmark(7, mean=(4.0, 1.0), cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24]]))
+    >>> [(one.index, one.landmark, round(one.d2, 2)) for one in report.candidates]
+    [(0, 7, 0.03)]
+    """
 
     index: int  # type: ignore[assignment]
     landmark: Id
@@ -65,6 +73,13 @@ class Compared(NamedTuple):
     """Compared pairs: observations (M,) with the `numbers` (M,) of landmarks (L,), and their squared distances (M,).
 
     `places` (L, 2 or 3) are those of the landmarks.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover, association=km.association.NearestNeighbour())
+    >>> slam.add_landmark(7, mean=(4.0, 1.0), cov=0.01 * np.eye(2))
+    >>> compared = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24]])).compared
+    >>> compared.rows, compared.landmarks, compared.places
+    (array([0]), [7], array([[4., 1.]]))
     """
 
     rows: Index
@@ -78,6 +93,13 @@ class JudgedScan(NamedTuple):
     """The observations `rows` of a scan that were compared with landmarks, and what came of it; `ids` of all the scan.
 
     d2 is NaN where the covariance of the innovation is not positive definite, infinite where nothing can be expected.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover)
+    >>> slam.add_landmark(7, mean=(4.0, 1.0), cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24]], ids=[7]))
+    >>> [(list(one.rows), list(one.names), one.done.fused) for one in report.judged]
+    [([0], [7], array([ True]))]
     """
 
     rows: Sequence[int]
@@ -137,6 +159,11 @@ class Repeat(NamedTuple):
     log-likelihood ratio of all pairs against chance, `p` how many such repeats are expected by chance in this map.
     `agrees`: the map's own covariance lets them be one.  `sure`: beyond doubt, by shape alone.  `newer` are all
     landmarks of the newer part.
+
+    >>> pairs = [(1, 21), (2, 22), (3, 23)]
+    >>> found = Repeat(pairs, np.zeros(3), np.zeros(2), np.array([2.5, 0.5]), 40.0, 1e-9, True, True, [21, 22, 23])
+    >>> found.pairs[0], found.p < 1e-6, found.sure
+    ((1, 21), True, True)
     """
 
     pairs: list[tuple[Id, Id]]
@@ -314,7 +341,14 @@ class Report:
 
 
 class LandmarkEstimate(NamedTuple):
-    """One landmark of the map."""
+    """One landmark of the map.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover)
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.0]], ids=[7]))
+    >>> [(one.id, one.kind, one.mean.round(2), one.observations) for one in slam.landmarks()]
+    [(7, 'point', array([4., 0.]), 1)]
+    """
 
     id: Id
     kind: str

@@ -21,6 +21,11 @@ class Answer(Enum):
     NONE: leave the observation alone.  DEFERRED: it cannot be decided yet.  NEW: it is not in the map.  MIXTURE: it is
     averaged over several landmarks.  REMAP: the robot is lost; what it observes may be mapped again until it
     relocalises.
+
+    >>> Answer.NEW
+    <Answer.NEW: -3>
+    >>> [one.name for one in Answer]
+    ['NONE', 'DEFERRED', 'NEW', 'MIXTURE', 'REMAP']
     """
 
     NONE = -1
@@ -59,7 +64,11 @@ class Matched(NamedTuple):
 
 @runtime_checkable
 class Association(Protocol):
-    """Decides which landmark each observation of a scan belongs to."""
+    """Decides which landmark each observation of a scan belongs to.
+
+    >>> isinstance(km.association.Automatic(), Association)
+    True
+    """
 
     def threshold(self, m: int, default: float) -> float:
         """Return the squared Mahalanobis distance up to which a pair is fused."""

@@ -34,6 +34,20 @@ class Query:
     """One scan before it is fused: the queries of an association about it.
 
     `reobserved` is the expected number of observations without ids that are of landmarks just seen.
+
+    >>> class Nearest:
+    ...     def threshold(self, m, default):
+    ...         return default
+    ...     def associate(self, query):
+    ...         names = query.candidates()
+    ...         d2 = query.distances(names)
+    ...         print(names, d2.round(2))
+    ...         return [(names[k], "the nearest one") for k in d2.argmin(axis=1)]
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover, association=Nearest())
+    >>> slam.add_landmark(7, mean=(4.0, 1.0), cov=0.01 * np.eye(2))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24]]))
+    [7] [[0.03]]
     """
 
     def __init__(self, scan: ScanContext) -> None:

@@ -91,13 +91,23 @@ def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
 
 
 def slam_from_config(path_or_name: str | Path) -> Slam:
-    """Return the filter of a configuration file or shipped name; the log it names gives robots, starts and the rest."""
+    """Return the filter of a configuration file or shipped name; the log it names gives robots, starts and the rest.
+
+    >>> slam_from_config("native")
+    <Slam of 'robot' before its first event: 0 landmarks, Invariant, ByIdentity>
+    """
     config = load_config(path_or_name)
     return build_slam(config) if config.log.path is None else build_slam(*open_run(path_or_name))
 
 
 def slam_described(said: dict[str, Any], **given: Any) -> Slam:
-    """Return the filter that `kalmark.slam.description.describe` describes, with models `given` for some of it."""
+    """Return the filter that `kalmark.slam.description.describe` describes, with models `given` for some of it.
+
+    >>> from kalmark.slam.description import describe
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam_described(describe(km.Slam(rover)))
+    <Slam of 'rover' before its first event: 0 landmarks, Invariant, ByIdentity>
+    """
     kept = {key: value for key, value in said.items() if key not in given}
     return build_slam(validate(Tree(kept, places={(): "settings"}), Config), **given)
 
@@ -106,6 +116,10 @@ def build_picture(config: Config, robots: Iterable[str]) -> Picture:
     """Return the options of pictures that a configuration has, of these robots.
 
     Raises ModelError if they do not fit together or to the robots.
+
+    >>> picture = build_picture(load_config("native", ["picture.view=top"]), ["rover"])
+    >>> picture.view, picture.sigmas
+    ('top', 3.0)
     """
     given: Picture | None = model_of(config.picture)
     picture = given or USUAL

@@ -30,6 +30,13 @@ def open_run(
     The log's description of its robots, sensors and landmarks is in force where the configuration has no value.
     In the place of a configuration there may be a log that describes all of its rig itself.
     Raises ConfigError, LogError.
+
+    >>> from kalmark.logs import write_native
+    >>> controls = {"t_s": [0.0, 0.1], "robot": ["rover"] * 2, "v_mps": [0.5, 0.5], "w_radps": [0.0, 0.1]}
+    >>> folder = write_native(km.log_from(controls=controls), "my_log")
+    >>> config, log = open_run("native", "my_log", ["association.type=auto"])
+    >>> config.association.type, len(log), build_slam(config, log)
+    ('auto', 2, <Slam of 'rover' before its first event: 0 landmarks, Invariant, Automatic>)
     """
     path, tree = tree_at(path_or_name, overrides)
     values = {key: value for key, value in tree.values.items() if key in ("log", "plugins")}
@@ -91,14 +98,28 @@ def with_log_description(config: Config, log: Log) -> Config:
 
 
 def effective_config(config: Config, log_path: str | Path | None = None) -> Config:
-    """Return the configuration with its log's path found, or replaced by `log_path`.  Raises ConfigError, LogError."""
+    """Return the configuration with its log's path found, or replaced by `log_path`.  Raises ConfigError, LogError.
+
+    >>> from kalmark.logs import write_native
+    >>> controls = {"t_s": [0.0, 0.1], "robot": ["rover"] * 2, "v_mps": [0.5, 0.5], "w_radps": [0.0, 0.1]}
+    >>> folder = write_native(km.log_from(controls=controls), "my_log")
+    >>> effective_config(load_config("native"), "my_log").log.path.endswith("my_log")
+    True
+    """
     named: dict[str, Any] = {name: resolve_path(config, getattr(config.log, name)) for name in ("truth", "fixes")}
     log = config.log.model_copy(update=named | resolve_options(config) | {"path": str(find_log(config, log_path))})
     return config.model_copy(update={"log": log})
 
 
 def open_config_log(config: Config, log_path: str | Path | None = None, *, progress: bool = False) -> Log:
-    """Return the log that a configuration names, or the one at `log_path` read in the same way."""
+    """Return the log that a configuration names, or the one at `log_path` read in the same way.
+
+    >>> from kalmark.logs import write_native
+    >>> controls = {"t_s": [0.0, 0.1], "robot": ["rover"] * 2, "v_mps": [0.5, 0.5], "w_radps": [0.0, 0.1]}
+    >>> folder = write_native(km.log_from(controls=controls), "my_log")
+    >>> len(open_config_log(load_config("native"), "my_log"))
+    2
+    """
     path, options = find_log(config, log_path), resolve_options(config)
     check_format(config, path)
     common = config.log.model_dump(include={*LogConfig.model_fields} - {"path"})

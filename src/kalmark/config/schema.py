@@ -438,7 +438,12 @@ class OfFile(Section):
 
 
 class Config(OfFile):
-    """Everything that decides a run.  A saved run's config.yaml is one of these and can be run again."""
+    """Everything that decides a run.  A saved run's config.yaml is one of these and can be run again.
+
+    >>> config = load_config("native", ["association.type=auto"])
+    >>> isinstance(config, Config), list(config.robots), config.association.type
+    (True, ['each'], 'auto')
+    """
 
     called: ClassVar[str] = "config"
 

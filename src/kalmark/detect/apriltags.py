@@ -31,7 +31,14 @@ def _detector(family: str) -> Any:
 
 @register("detector", "tags")
 class Tags:
-    """Tags of one family and one size, by the pixels of their corners, as a `TagCorners` sensor takes them."""
+    """Tags of one family and one size, by the pixels of their corners, as a `TagCorners` sensor takes them.
+
+    >>> eye = km.Mount(km.sensors.TagCorners(), detector=km.detect.Tags(size_m=0.2))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Velocity3D(), sensors={"eye": eye}))
+    >>> image = np.full((480, 640), 255, np.uint8)  # without a tag
+    >>> slam.process(km.Frame(0.0, "drone", "eye", image)).observations
+    ()
+    """
 
     columns: ClassVar[tuple[str, ...]] = TagCorners.columns
     takes: ClassVar[type[Raw]] = Frame

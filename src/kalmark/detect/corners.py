@@ -33,6 +33,10 @@ class Walls(Laser):
     it may be longer.  Covariances (K, 2, 2) are of the first two numbers.  A piece of surface is cut where it bends by
     more than `split_m`.  A wall has at least `beams` beams and `length_m`, and fits a line by the chi-square of its
     ranges.  Its ends (K, 2, 2), m in the laser's frame, are an attribute, too.
+
+    >>> a = np.linspace(-1.0, 1.0, 201)
+    >>> km.detect.Walls().detect(4.0 / np.cos(a), a).y[:, :2].round(2)
+    array([[4., 0.]])
     """
 
     columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad", "right_m", "left_m")
@@ -70,6 +74,11 @@ class Corners(Walls):
 
     The angle, rad, is the signature, over pi where the corner stands out.  One is where two walls meet that follow each
     other in the scan: within `gap_m` of the ends of both, and at `bend_deg` at least.
+
+    >>> a = np.linspace(-0.5, 1.5, 401)
+    >>> room = np.minimum(4.0 / np.cos(a), 3.0 / np.maximum(np.sin(a), 1e-3))
+    >>> km.detect.Corners().detect(room, a).y.round(2)
+    array([[5.  , 0.64, 1.57]])
     """
 
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "opening_rad")

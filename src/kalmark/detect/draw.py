@@ -21,6 +21,12 @@ def draw_scan(ranges: Any, angles: Any, found: Detections, range_max_m: float = 
     """Draw the beams that came back, what was found with its 3-sigma ellipses, and the laser at the origin; x is ahead.
 
     Circles are drawn as such, corners and reflectors as crosses, walls as lines between their ends.  Returns the axes.
+
+    >>> a = np.linspace(-1.0, 1.0, 201)
+    >>> r = 4.0 / np.cos(a)
+    >>> axes = km.detect.draw_scan(r, a, km.detect.Walls().detect(r, a))
+    >>> axes.get_aspect()
+    1.0
     """
     import matplotlib.pyplot as plt
 

@@ -25,6 +25,11 @@ class Detections:
 
     p is m, but 2 for walls, whose ends have no error that counts.  `beams` (K, 2) are the first and the last beam of
     each, `attributes` what else is known of them, K of each.
+
+    >>> a = np.linspace(-1.0, 1.0, 201)
+    >>> found = km.detect.Reflectors().detect(np.full(201, 4.0), a, abs(a - 0.5) < 0.022)
+    >>> len(found), found.columns, found.cov.shape
+    (1, ('range_m', 'bearing_rad'), (1, 2, 2))
     """
 
     columns: tuple[str, ...]

@@ -20,6 +20,10 @@ class Reflectors(Laser):
     is at least `intensity_min`, on one surface.  Its radius is too large if it is wider than `width_max_m`.  The
     bearing lies anywhere where the outermost beams still hit and the next ones do not: its variance is that of the
     interval.
+
+    >>> a = np.linspace(-1.0, 1.0, 201)
+    >>> km.detect.Reflectors().detect(np.full(201, 4.0), a, abs(a - 0.5) < 0.022).y.round(2)
+    array([[4. , 0.5]])
     """
 
     intensity_min: Annotated[NotNegative, "A beam from a reflector is as bright as this at least."] = 1.0

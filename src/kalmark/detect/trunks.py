@@ -33,6 +33,11 @@ class Trunks(Laser):
     between `radius_min_m` and `radius_max_m`, and its beams within `roughness_m` of the circle, RMS.  `beam_width_rad`
     is the divergence of a beam, full angle: where it grazes an edge it is reflected from anywhere across it.
     `sigma_position_m` is added to the radius too.
+
+    >>> a = np.linspace(-1.5, 1.5, 301)
+    >>> post = np.where(abs(a) < 0.06, 2.0 - np.sqrt(0.15**2 - (2.0 * a).clip(-0.15, 0.15) ** 2), np.inf)
+    >>> km.detect.Trunks().detect(post, a).y.round(2)
+    array([[1.95, 0.  , 0.11]])
     """
 
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "radius_m")

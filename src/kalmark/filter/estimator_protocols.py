@@ -17,6 +17,11 @@ class Update(NamedTuple):
     `model` is the observation model, compiled (a tuple) or in Python; `robot` and `mount` are slots, `mount` -1 if it
     is not in the map.  Observations with d2 > gate are not fused.  With `parallax`, inverse distances are corrected by
     the parallax that they stand for, if the estimator iterates; a sensor that finds depth measures the distances.
+
+    >>> y, R = np.array([[4.0, 0.3]]), np.diag([0.01, 0.0004])[None]
+    >>> one = Update(km.sensors.RangeBearing(), robot=0, mount=-1, slots=np.array([1]), d=2, y=y, R=R)
+    >>> one.gate, one.parallax
+    (inf, True)
     """
 
     model: Any
@@ -36,6 +41,12 @@ class Movement(NamedTuple):
     `model` is the motion, compiled (a tuple) or in Python; `added` are the slots of constant blocks that change the
     control: their numbers (c,), one after the other, add B (m, c) times them to it.  One has its error where that is
     `shared` with other parts.  D is the noise gathered in the robot's frame, (0, 0) for none.
+
+    >>> rover = km.motion.Unicycle()
+    >>> u = np.array([0.5, 0.1])
+    >>> one = Movement(rover, 0, [], False, np.zeros((2, 0)), u, rover.control_noise(u), np.zeros((0, 0)), dt_s=0.1)
+    >>> one.model.move(np.zeros(3), one.u, one.dt_s)[0].round(3)
+    array([0.05, 0.  , 0.01])
     """
 
     model: Any
@@ -54,6 +65,13 @@ class Correction(NamedTuple):
 
     Where the correction is not `valid`, some could not be fused: d2 is infinite of those of which nothing can be
     expected, NaN of those whose covariance is not positive definite.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover)
+    >>> slam.add_landmark(7, mean=(4.0, 1.0), cov=0.01 * np.eye(2))
+    >>> done = slam.process(km.Scan(0.0, "rover", "lidar", [[4.12, 0.24]], ids=[7])).judged[0].done
+    >>> done.e.round(3), done.z.round(3), done.d2.round(2), done.fused, done.valid
+    (array([[4.123, 0.245]]), array([[-0.003, -0.005]]), array([0.03]), array([ True]), True)
     """
 
     e: Array
@@ -65,7 +83,11 @@ class Correction(NamedTuple):
 
 
 class Estimator(Protocol):
-    """Prediction and correction of the map by motions and scans."""
+    """Prediction and correction of the map by motions and scans.
+
+    >>> km.estimators.Ekf().coordinates, km.estimators.Ekf().default_gate, km.estimators.Invariant().coordinates
+    ('world', 9.0, 'log')
+    """
 
     coordinates: ClassVar[str]
     default_gate: ClassVar[float]
@@ -85,7 +107,11 @@ class Estimator(Protocol):
 
 @runtime_checkable
 class CompilingEstimator(Protocol):
-    """An estimator that is compiled, and can begin with that before it is needed."""
+    """An estimator that is compiled, and can begin with that before it is needed.
+
+    >>> [isinstance(one, CompilingEstimator) for one in (km.estimators.Ekf(), km.estimators.Textbook())]
+    [True, False]
+    """
 
     def compile_ahead(self, axes: int, inverse_depths: bool, dependent: bool) -> None:
         """Begin to compile the correction of a map of these axes, as `corrections.routines`, on a second core."""
@@ -93,7 +119,13 @@ class CompilingEstimator(Protocol):
 
 @runtime_checkable
 class Iterating(Protocol):
-    """An estimator that linearises an observation more than once."""
+    """An estimator that linearises an observation more than once.
+
+    >>> [isinstance(one, Iterating) for one in (km.estimators.Ekf(), km.estimators.Invariant())]
+    [False, True]
+    >>> km.estimators.Invariant().once()
+    Invariant(iterations=1, tolerance=0.001)
+    """
 
     def once(self) -> Estimator:
         """Return the estimator that linearises everything at the prediction."""
@@ -101,7 +133,11 @@ class Iterating(Protocol):
 
 @runtime_checkable
 class Averaging(Protocol):
-    """An estimator that can fuse the mean over matchings, as `km.association.Averaged` requires."""
+    """An estimator that can fuse the mean over matchings, as `km.association.Averaged` requires.
+
+    >>> isinstance(km.estimators.Invariant(), Averaging), isinstance(km.estimators.Textbook(), Averaging)
+    (True, False)
+    """
 
     def average(self, map_: Map, update: Update, pairs: Index, weights: Array) -> tuple[Array, bool]:
         """Fuse the mean over matchings (H, K), numbers of slots or -1, of these weights (H,).
@@ -112,7 +148,11 @@ class Averaging(Protocol):
 
 @runtime_checkable
 class Initializing(Protocol):
-    """An estimator that adds a landmark, seen for the first time, by its own equations."""
+    """An estimator that adds a landmark, seen for the first time, by its own equations.
+
+    >>> [isinstance(one, Initializing) for one in (km.estimators.Ekf(), km.estimators.Textbook())]
+    [False, True]
+    """
 
     def initialize(self, map_: Map, robot: int, space: Space, l: Array, L_r: Array, Q: Array) -> int:
         """Add a landmark l (n,) with L_r (n, d) by the robot's first d errors and noise Q (n, n); return its slot."""
@@ -120,7 +160,11 @@ class Initializing(Protocol):
 
 @runtime_checkable
 class Selective(Protocol):
-    """An estimator of some robots, sensors and landmarks only."""
+    """An estimator of some robots, sensors and landmarks only.
+
+    >>> [isinstance(one, Selective) for one in (km.estimators.Ekf(), km.estimators.Textbook())]
+    [False, True]
+    """
 
     def refuse_misfits(
         self, robots: Mapping[str, Any], channels: Mapping[Any, Any], policies: Mapping[Any, Any]

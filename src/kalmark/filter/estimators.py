@@ -152,6 +152,11 @@ class Ekf(_Estimator):
     """The textbook filter, landmark by landmark.
 
     Gate 3 sigma.  [S] (26)-(30), C.3.  Overconfident: for comparison.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover, estimator=km.estimators.Ekf())
+    >>> slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3]], ids=[7])).observations[0].outcome
+    'new'
     """
 
     coordinates: ClassVar[str] = "world"
@@ -168,6 +173,11 @@ class Invariant(_Estimator):
     nothing seen moves by more than `tolerance` of its sigma; the next time would change about a thousandth of that.
     Once is enough for small corrections by relative measurements; fixes are always iterated, and so should be landmarks
     known beforehand.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover, estimator=km.estimators.Invariant(iterations=1))
+    >>> slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3]], ids=[7])).observations[0].outcome
+    'new'
     """
 
     iterations: Annotated[Count, "At most this many linearisations of a scan."] = 30
@@ -200,6 +210,11 @@ class Fej(_Estimator):
     """First-estimates Jacobians.
 
     Consistent while the first estimates are good, diverged when they are not.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover, estimator=km.estimators.Fej())
+    >>> slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3]], ids=[7])).observations[0].outcome
+    'new'
     """
 
     coordinates: ClassVar[str] = "world"

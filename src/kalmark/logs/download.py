@@ -50,7 +50,11 @@ class DataFile:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Describe a dataset that can be fetched; `log` is its path below the data folder."""
+    """Describe a dataset that can be fetched; `log` is its path below the data folder.
+
+    >>> [(one.name, one.log) for one in list_data() if isinstance(one, Dataset)][:1]
+    [('lost_in_the_woods', 'lost_in_the_woods')]
+    """
 
     name: str
     what: str
@@ -106,7 +110,11 @@ def list_data() -> tuple[Dataset, ...]:
 
 
 def cache_folder() -> Path:
-    """Return the download cache."""
+    """Return the download cache.
+
+    >>> (cache_folder() / "lost_in_the_woods").name
+    'lost_in_the_woods'
+    """
     return Path(os.environ.get("KALMARK_CACHE") or platformdirs.user_cache_path("kalmark") / "data")
 
 
@@ -115,6 +123,9 @@ def fetch(name: str, progress: Progress | None = None) -> Path:
 
     Files in `KALMARK_DATA` are used without the network.  A dataset appears in the cache only once all its files
     have come and fit their hashes.  Raises DataError.
+
+    >>> fetch("lost_in_the_woods").name  # doctest: +SKIP
+    'lost_in_the_woods'
     """
     plain = name.strip("/")
     wanted = [dataset for dataset in list_data() if f"{dataset.name}/".startswith(f"{plain}/")]
@@ -274,6 +285,11 @@ def find_data(path: Path | str, base: Path | str | None = None) -> Path:
     A relative path is searched in `base` (default: the working folder), then in `KALMARK_DATA`, `KALMARK_ORACLE` and
     the download cache.  It may begin with the name of these folders themselves, as oracle/NAME.json.gz does for a
     `KALMARK_ORACLE` that ends in /oracle.
+
+    >>> log = km.log_from(controls={"t_s": [0.0], "robot": ["rover"], "v_mps": [0.5], "w_radps": [0.0]})
+    >>> folder = write_native(log, "my_log")
+    >>> find_data("my_log").name
+    'my_log'
     """
     path = Path(path)
     with suppress(RuntimeError):  # ~ and the name of nobody: a file may be named so

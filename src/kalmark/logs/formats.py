@@ -107,6 +107,12 @@ def stream_log(
 
     The rows of each file must be in the order of time; the arguments are those of `open_log`.  Raises LogError, for a
     bad row when it is reached.
+
+    >>> from kalmark.logs import stream_log, write_native
+    >>> controls = {"t_s": [0.0, 0.1], "robot": ["rover"] * 2, "v_mps": [0.5, 0.5], "w_radps": [0.0, 0.1]}
+    >>> folder = write_native(km.log_from(controls=controls), "my_log")
+    >>> [event.t_s for event in stream_log("my_log")]
+    [0.0, 0.1]
     """
     _, found = recognise(find_data(path), NATIVE.name)
     request = request_of(robot_names(robots), on_error, progress)

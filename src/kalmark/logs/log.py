@@ -23,6 +23,10 @@ class Trajectory:
 
     `t_ns` (N,) is strictly increasing; `poses` is (N, 3) x y theta or (N, 7) x y z qx qy qz qw (m, rad; quaternions
     Hamilton, local to global).
+
+    >>> true = Trajectory([0, 500_000_000], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.2]])
+    >>> true.at([250_000_000])
+    array([[0.5, 0. , 0.1]])
     """
 
     t_ns: Times
@@ -95,6 +99,10 @@ class PositionTrack:
     """Position fixes that only score a run.
 
     `t_ns` (N,); `xy` (N, 2) m in a frame of their own, of the antenna at `antenna` (2,) m in the robot's frame.
+
+    >>> track = PositionTrack(t_ns=[0, 1_000_000_000], xy=[[0.0, 0.0], [1.0, 0.0]], antenna=[0.2, 0.0])
+    >>> len(track), track.xy.shape
+    (2, (2, 2))
     """
 
     t_ns: Times
@@ -126,6 +134,11 @@ class Log:
     a configuration, which may overrule it.  `reference` has figures of other programs on this log, by program, named
     as in ``summary.json``.  `true_ids` has the landmarks of scans whose ids are hidden, to score the association.
     `options` are those it was opened with, as the section `log` of a configuration has them.
+
+    >>> controls = {"t_s": [0.0, 0.1], "robot": ["rover"] * 2, "v_mps": [0.5, 0.5], "w_radps": [0.0, 0.1]}
+    >>> log = km.log_from(controls=controls)
+    >>> len(log), log.control_columns, log.truth
+    (2, {'rover': ('v_mps', 'w_radps')}, {})
     """
 
     name: str

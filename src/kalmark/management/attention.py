@@ -26,6 +26,12 @@ class Attention:
     """Selection of the landmarks to correct, of places for new ones, and of landmarks to remove.
 
     By default all is used and none given up.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing(), attention=km.Attention(starts=1))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=[7, 8]))
+    >>> slam.landmarks().ids
+    [7]
     """
 
     updates: Annotated[

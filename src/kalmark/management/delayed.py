@@ -43,6 +43,11 @@ class Delayed:
     `spacing_m` of the way, the last `poses` of them kept.  A candidate starts when its sigma is below `precision` of
     its distance, even without any one of its measurements, and is dropped when at `patience` clones in a row it was in
     view and not observed; the best `candidates` are kept.
+
+    >>> camera = km.Mount(km.sensors.Bearing(), initialization=km.Delayed(spacing_m=0.2))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"camera": camera}))
+    >>> slam.process(km.Scan(0.0, "rover", "camera", [[0.5]], ids=[7])).observations[0].outcome
+    'deferred'
     """
 
     persistence: Annotated[Count, "Intersections that must have been merged into one."] = 4

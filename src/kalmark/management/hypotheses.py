@@ -52,6 +52,11 @@ class Hypotheses:
 
     A point follows when one position is left of them.  A hypothesis whose share of the weights falls below `odds` is
     removed.
+
+    >>> beacon = km.Mount(km.sensors.Range(), initialization=km.initialization.Hypotheses(count=8))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"radio": beacon}))
+    >>> slam.process(km.Scan(0.0, "rover", "radio", [[4.0]], ids=[7])).observations[0].outcome
+    'tentative'
     """
 
     count: Annotated[int, Within(ge=3), "Hypotheses of the direction."] = 12

@@ -50,7 +50,11 @@ class Step(NamedTuple):
 
 @runtime_checkable
 class Initialization(Protocol):
-    """A way to start a landmark with an id from measurements of which one alone does not determine it."""
+    """A way to start a landmark with an id from measurements of which one alone does not determine it.
+
+    >>> isinstance(km.initialization.Trilateration(), Initialization)
+    True
+    """
 
     def observe(self, scan: ScanContext, k: int, pending: Pending) -> Step:
         """Return what the k-th observation of a scan does to what is pending of its landmark."""

@@ -87,6 +87,11 @@ class Trilateration:
 
     `poses` is the number of ranges kept of a landmark: of more, every other one is given up.  The search starts in
     `directions` directions; a second answer whose odds are above `odds` means to wait.
+
+    >>> beacon = km.Mount(km.sensors.Range(), initialization=km.initialization.Trilateration())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"radio": beacon}))
+    >>> slam.process(km.Scan(0.0, "rover", "radio", [[4.0]], ids=[7])).observations[0].outcome
+    'deferred'
     """
 
     poses: Annotated[int, Within(ge=4), "Ranges kept of one landmark; of more, every other one is given up."] = 24

@@ -28,6 +28,14 @@ class Upkeep:
     times likelier that nothing is there (`existence.py`).  The detection probability of the sensor
     is estimated from the log.  Where it is stated, `p_detect`, each scan counts, with ids too, and what is gone is
     removed.  `p_false` is the probability that something else is taken for a landmark that is gone.
+
+    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
+    >>> slam = km.Slam(rover, association=km.association.Automatic(), upkeep=km.Upkeep(confirm=2))
+    >>> for t_s in (0.0, 0.1):
+    ...     report = slam.process(km.Scan(t_s, "rover", "lidar", [[4.0, 0.3]]))
+    ...     print([one.outcome for one in report.observations], len(slam.landmarks()))
+    ['tentative'] 0
+    ['new'] 1
     """
 
     confirm: Annotated[

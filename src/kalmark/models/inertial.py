@@ -259,6 +259,14 @@ def start_at_rest(motion: Inertial, t_s: Array, u: Array, start: Array, cov: Arr
     to the vertical by the shortest way.  A bias of the force is not distinguishable from a tilt, so both have the sigma
     of its prior and are correlated.  With the gravity in the state the attitude is the start's and the gravity is found
     instead.  Raises ModelError if the unit does not begin at rest.
+
+    >>> unit, t_s = km.motion.Inertial(), 0.01 * np.arange(500)
+    >>> noise = np.random.default_rng(0).normal(size=(500, 6)) * [*[0.001] * 3, *[0.01] * 3]
+    >>> u = noise + [0.01, 0.0, 0.0, 0.0, 0.0, 9.81]
+    >>> start, cov = np.array([0.0] * 6 + [1.0] + [0.0] * 9), np.diag([1e-4] * 6 + [1.0] * 3 + [1e-2] * 6)
+    >>> rest = km.motion.start_at_rest(unit, t_s, u, start, cov)
+    >>> rest.until_s, rest.start[10:13].round(3)  # the bias of the rate
+    (4.99, array([ 0.01,  0.  , -0.  ]))
     """
     count = _resting(motion, t_s, u, np.sqrt(np.diag(cov)))
     until_s, dt_s = float(t_s[count - 1]), float(np.median(np.diff(t_s)))

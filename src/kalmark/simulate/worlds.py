@@ -80,7 +80,12 @@ AnySimulatedRobot = Annotated[
 
 
 class World(OfFile):
-    """A world to simulate: landmarks, robots, noise, and how long."""
+    """A world to simulate: landmarks, robots, noise, and how long.
+
+    >>> world = load_world("cloister", ["steps=100"])
+    >>> isinstance(world, World), world.steps, world.dt_s, list(world.robots)
+    (True, 100, 0.1, ['robot'])
+    """
 
     called: ClassVar[str] = "world"
 

@@ -52,6 +52,10 @@ class ActiveSearch:
     `contrast` grey values a pixel; a match correlates by `accept` at least.  `keep` selects the landmarks that stay:
     "global" those that are found in half of the searches for them, the `most` best, "odometry" only those in view.  The
     search begins with a random landmark, by `seed`: the same seed, the same result.
+
+    >>> camera = km.Mount(km.sensors.PinHole(), detector=km.vision.ActiveSearch(in_view=30))
+    >>> camera.detector.columns
+    ('u_px', 'v_px')
     """
 
     columns: ClassVar[tuple[str, ...]] = PinHole.columns

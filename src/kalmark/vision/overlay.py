@@ -25,6 +25,14 @@ def overlay(front_end: FrontEnd | LineFrontEnd, report: Report, scale: int = 1) 
     Search ellipses of three sigmas in yellow where the landmark was found, in red where it was not; matches are green
     dots, those that the filter rejected magenta; new landmarks are blue circles.  What agreed with the base of the
     one-point RANSAC was not searched in an ellipse.  Lines are drawn in the same colours, as expected and as measured.
+
+    >>> found = km.landmarks.Homogeneous(prior_rho_per_m=0.5, sigma_rho_per_m=0.25)
+    >>> eye = km.Mount(km.sensors.PinHole(), landmark=found, detector=km.vision.ActiveSearch())
+    >>> slam = km.Slam(km.Robot("hand", km.motion.ConstantVelocity3D(), sensors={"eye": eye}))
+    >>> image = np.random.default_rng(0).integers(0, 255, (24, 32), np.uint8).repeat(20, axis=0).repeat(20, axis=1)
+    >>> report = slam.process(km.Frame(0.0, "hand", "eye", image))
+    >>> km.vision.overlay(slam.state.sources["hand", "eye"], report, scale=2).shape
+    (960, 1280, 3)
     """
     cv2 = front_end.cv2
     size = (front_end.image.shape[1] * scale, front_end.image.shape[0] * scale)

@@ -42,6 +42,10 @@ class LineSearch:
     `min_length_px`.  A match has a profile of grey values across that correlates by `accept` with that of the line.  A
     line that leaves the view before it has fitted often is given up: little is known of it, perhaps not the side of the
     camera it is on.  Of more than `most` lines those out of view that fitted least make room.
+
+    >>> camera = km.Mount(km.sensors.Segments(), detector=km.vision.LineSearch(in_view=10))
+    >>> camera.detector.columns
+    ('u1_px', 'v1_px', 'u2_px', 'v2_px')
     """
 
     columns: ClassVar[tuple[str, ...]] = Segments.columns

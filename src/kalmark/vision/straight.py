@@ -13,7 +13,14 @@ from kalmark.vision.opencv import opencv
 
 
 class Straightened:
-    """The grey images of a camera, as one at the same place takes them that has `intrinsics` (4,) and size `image`."""
+    """The grey images of a camera, as one at the same place takes them that has `intrinsics` (4,) and size `image`.
+
+    >>> bent = km.sensors.PinHole(lens="radtan", distortion=(-0.28, 0.07, 0.0, 0.0))
+    >>> straight = Straightened(bent, np.array([320.0, 320.0, 320.0, 240.0]), (640, 480))
+    >>> u, v = straight.maps
+    >>> u.shape, u[240, [0, 320, 639]].round(1)
+    ((480, 640), array([ 67.2, 320. , 572.3], dtype=float32))
+    """
 
     def __init__(self, camera: Any, intrinsics: Array, image: tuple[float, float]) -> None:
         self.camera, self.intrinsics, self.size = camera, intrinsics, image
