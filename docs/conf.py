@@ -34,6 +34,7 @@ extensions = [
 exclude_patterns = ["course", "tutorials", "site", "**/*.ipynb"]
 root_doc = "index"
 language = "en"
+highlight_language = "none"  # of a block that names none: rows of a file, what a program prints
 maximum_signature_line_length = 90
 add_module_names = False
 toc_object_entries = False
@@ -63,7 +64,7 @@ sphinx_gallery_conf = {
     "image_srcset": ["2x"],
     "capture_repr": ("_repr_html_",),  # a page shows what it prints
     "copyfile_regex": r".*\.csv",
-    "default_thumb_file": str(DOCS / "images" / "cloister.png"),
+    "default_thumb_file": str(DOCS / "site" / "static" / "program.svg"),  # of a program without a picture
 }
 
 for pages, programs in zip(sphinx_gallery_conf["gallery_dirs"], sphinx_gallery_conf["examples_dirs"], strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.errors import ModelError
+from kalmark.errors import MapError, ModelError
 from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose, move
 from kalmark.geometry.rotations import from_euler, multiply
@@ -170,6 +170,16 @@ def test_lines_locate_the_robot_and_their_segments_grow() -> None:
         ends, cov = slam.segment(5)
         assert ends.shape == (2, 3) and cov.shape == (2, 3, 3) and np.isfinite(ends).all()
         assert np.linalg.norm(slam.mean("r")[:3] - truth[:3]) < 0.1, kind.kind
+
+
+def test_a_place_of_three_numbers_is_a_point_of_space_also_where_no_sensor_is() -> None:
+    slam = km.Slam(km.Robot("r", km.motion.Odometry3D()))
+    slam.add_landmark("mast", mean=(4.0, 1.0, 0.5), cov=0.01 * np.eye(3))
+    slam.add_landmark("exact", mean=(2.0, 1.0, 0.0))
+    assert slam.landmark_model("mast").kind == slam.landmark_model("exact").kind == "point3"
+    np.testing.assert_allclose(slam.mean("mast"), (4.0, 1.0, 0.5))
+    with pytest.raises(MapError, match="expected 3 finite"):
+        slam.add_landmark("flat", mean=(4.0, 1.0))
 
 
 @pytest.mark.parametrize("kind", LINES, ids=lambda kind: kind.__name__)

@@ -48,11 +48,11 @@ for robot in robots:
 # Figure 1
 # --------
 #
-# Squares are sensors, dotted lines observations, the ellipses have three sigmas. Landmarks 0, 1 and 3, which both
-# robots see, connect them: their corrections make the poses of A and B correlated.
+# Squares are sensors, dotted lines observations, numbers landmarks; the ellipses have three sigmas. Landmarks 0, 1 and
+# 3, which both robots see, connect them: their corrections make the poses of A and B correlated.
 for row in slam.landmarks():
     ax.plot(*km.geometry.ellipse(row.mean, row.covariance, sigmas=3, points=60).T, "C2")
-    ax.annotate(f"landmark {row.id}", row.mean + np.array([0.1, 0.5]))
+    ax.annotate(row.id, row.mean, ha="center", va="center", bbox={"boxstyle": "circle", "fc": "w", "ec": "none"})
 for robot in robots:
     r, P = slam.mean(robot.name), slam.covariance(robot.name)
     ax.plot(*r[:2], "k", marker=f"${robot.name}$", ms=10)

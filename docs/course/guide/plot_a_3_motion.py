@@ -47,7 +47,7 @@ for step in range(1, 61):
 # start like a banana, and no ellipse can do that. Only measurements keep the heading well known.
 ax.plot(*np.array(path)[:, :2].T, "k--", lw=1, label="without noise")
 ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-ax.legend(loc="lower right")
+figure.legend(loc="outside right center")
 inside = [km.geometry.mahalanobis(r[:2], slam.x[:2], slam.P[:2, :2]) < 2 for r in robots]
 print(f"inside two sigmas at the end: {np.mean(inside):.0%}; of a Gaussian: 86%")
 plt.show()

@@ -66,7 +66,7 @@ for ax, (x, s, truth) in zip(axes, shown, strict=True):
     ax.plot(t, truth, "k--", lw=1, label="truth")
 axes[0].set(ylabel="angle [rad]")
 axes[1].set(xlabel="t [s]", ylabel="rate [rad/s]")
-axes[1].legend(loc="upper right")
+figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=2)
 plt.show()
 
 # %%

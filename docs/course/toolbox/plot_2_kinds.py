@@ -44,14 +44,14 @@ kinds, mount = figure.add_subplot(1, 3, 2), figure.add_subplot(1, 3, 3)
 ax.plot(*np.array(list(log.landmarks.values())).T, "k+", ms=4)
 for name, trajectory in log.truth.items():
     ax.plot(*trajectory.poses[:, :3].T, label=name)
-ax.legend()
+ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.05), ncols=2)
 for kind, counts in counted.items():
-    kinds.plot(*np.array(counts).T, ".", ms=3, label=kind)
-kinds.set(xlabel="t [s]", title="landmarks of each kind")
-kinds.legend()
+    kinds.plot(*np.array(counts).T, drawstyle="steps-post", label=kind)
 t, *rows = np.array(sigmas).T
-mount.semilogy(t, np.transpose(rows))
-mount.set(xlabel="t [s]", title="sigmas of the mount [m], [rad]")
+mount.semilogy(t, np.transpose(rows), label=[*"xyz", *(f"about {axis}" for axis in "xyz")])
+for ax, title in (kinds, "landmarks of each kind"), (mount, "sigmas of the mount [m], [rad]"):
+    ax.set(xlabel="t [s]", title=title)
+    ax.legend()
 plt.show()
 
 # %%

@@ -16,6 +16,7 @@ from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Track
 
 NO_LENS = np.zeros(0)
+POINTS: dict[str, Landmark] = {"plane": Point2D(), "space": Point3D()}
 
 
 @runtime_checkable
@@ -42,7 +43,7 @@ def surveyed_type(model: Landmark, mean: Any) -> Landmark:
         return PointHeight2D()
     if not isinstance(model, UnknownDepth) or np.size(mean) == model.space.size:
         return model
-    return Point2D() if model.space.world == "plane" else Point3D()
+    return POINTS[model.space.world]
 
 
 def point_if_linear(scan: ScanContext, track: Track, threshold: float) -> Simplified | None:

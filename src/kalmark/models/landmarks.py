@@ -169,7 +169,7 @@ class Point3D(_Landmark):
     """A Euclidean point (x, y, z) of space.
 
     >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D()))
-    >>> slam.add_landmark("tree", mean=(4.0, 1.0, 0.5), cov=0.01 * np.eye(3), landmark=km.landmarks.Point3D())
+    >>> slam.add_landmark("tree", mean=(4.0, 1.0, 0.5), cov=0.01 * np.eye(3))
     >>> slam.mean("tree"), slam.landmark_model("tree").kind
     (array([4. , 1. , 0.5]), 'point3')
     """

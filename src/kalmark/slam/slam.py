@@ -47,7 +47,6 @@ from kalmark.geometry.spaces import RHO
 from kalmark.management import reparametrize as points
 from kalmark.management.attention import reasons_against_start
 from kalmark.management.upkeep import CAREFUL, Upkeep
-from kalmark.models.landmarks import Point2D
 from kalmark.models.protocols import Landmark
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import by_ids, locating, maintenance, moves, starting, state_corrections, tentative
@@ -402,13 +401,16 @@ class Slam(Estimate):
     def add_landmark(self, name: Id, mean: Any, cov: Any = None, landmark: Landmark | None = None) -> None:
         """Add a landmark known beforehand, by survey: exactly (`cov` None) or with a covariance.
 
-        Landmarks known exactly stay outside the map: no step depends on how many there are (docs/localization.md).
+        Without a `landmark` it is of the type that the first sensor starts, or a point where that has an unknown depth
+        and where there is no sensor.  Landmarks known exactly stay outside the map: no step depends on how many there
+        are (docs/localization.md).
         """
         state = self.state
         name = checked_id(name, "landmark")
         if landmark is not None:
             instance(landmark, Landmark, f"landmark {name!r}", "a landmark model")
-        default = next((channel.landmark for channel in state.channels.values()), Point2D())
+        point = points.POINTS[next(iter(state.robots.values())).motion.space.world]
+        default = next((channel.landmark for channel in state.channels.values()), point)
         model = landmark or points.surveyed_type(default, mean)
         refuse_other_world(state.robots, model.kind, model.space.world)
         if state.is_there(name) or name in state.inner:
