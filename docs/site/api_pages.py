@@ -100,6 +100,12 @@ def is_code(thing: Any) -> bool:
     return callable(thing) and get_origin(thing) is None
 
 
+def _value(thing: Any) -> str:
+    """Return a value that is short, else its type."""
+    value = plain_names(repr(thing))
+    return f"``{value}``" if len(value) < 200 else f"A ``{type(thing).__name__}``."
+
+
 def _head(title: str) -> str:
     return f"{title}\n{'=' * len(title)}\n"
 
@@ -132,7 +138,10 @@ def _module(shown: str, module: Any, names: dict[str, str]) -> str:
     for group, members in groups.items():
         if len(groups) > 1:
             parts += [group, "-" * len(group), ""]
-        told = [(f":doc:`{n} <{names[n]}>`", rst(_summary(getattr(module, n)))) for n in members]
+        told = [
+            (f":doc:`{n} <{names[n]}>`", rst(_summary(getattr(module, n))) or _value(getattr(module, n)))
+            for n in members
+        ]
         parts += [_list(told)]
     inner = [other for _, other, _ in PARTS if other.rpartition(".")[0] == shown]
     below = (
@@ -178,12 +187,7 @@ def page_of_name(shown: str, name: str, thing: Any) -> str:
     elif is_code(thing):
         parts += [f".. py:function:: {name}{signature_of(thing)}", "", _indented(rst(_docstring(thing)))]
     else:
-        value = plain_names(repr(thing))
-        parts += [
-            f".. py:data:: {name}",
-            "",
-            _indented(f"``{value}``" if len(value) < 200 else f"A ``{type(thing).__name__}``."),
-        ]
+        parts += [f".. py:data:: {name}", "", _indented(_value(thing))]
     return "\n".join([*parts, ""])
 
 

@@ -21,6 +21,7 @@ def link(app: Any, name: str, source: list[str]) -> None:
     """Point the pages to these instead of the files above them, and to the page of a program; show titles of pages."""
     for file, page in FILES.items():
         source[0] = source[0].replace(f"](../{file}", f"]({page}")
+    source[0] = re.sub(r"(?<=: )docs/(\w+\.md)", r"[\1](\1)", source[0])  # of a docstring
     source[0] = re.sub(r"\[\w+\.md\](?=\([\w./]+\.md)", "[]", source[0])  # MyST shows the title of an empty link
     source[0] = source[0].replace("](course/items.csv)", "](lessons/items.md)")
     source[0] = re.sub(r"\]\(course/(\w+)/\)", r"](lessons/\1/index.rst)", source[0])

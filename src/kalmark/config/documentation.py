@@ -97,7 +97,8 @@ def page() -> str:
 
 
 def _section(title: str, model: type[BaseModel], common: type[BaseModel] = Section) -> str:
-    return f"## {title}\n\n{inspect.getdoc(model)}\n\n{_table(model, common)}\n"
+    prose = str(inspect.getdoc(model)).partition("\n\n>>>")[0]
+    return f"## {title}\n\n{prose}\n\n{_table(model, common)}\n"
 
 
 def _options() -> str:

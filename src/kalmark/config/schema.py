@@ -216,7 +216,7 @@ class Mounted(ModelSection):
     robust: Literal["huber", "student"] | None = None
     """Robust weight of outliers: bounded, or nearly zero.  All observations count in full if absent."""
     preset: Preset | None = None
-    """Take what is not given from a documented sensor of this type: see presets.md."""
+    """Take what is not given from a documented sensor of this type: docs/presets.md."""
 
     @model_validator(mode="before")
     @classmethod

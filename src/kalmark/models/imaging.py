@@ -116,7 +116,7 @@ class _Lens(_PinHole):
 class PinHole(_Lens):
     """A camera that measures points: pixels u, v.
 
-    [TB] pinHole.  `calibration` names a file of OpenCV, Kalibr, ROS or EuRoC instead: cameras.md.
+    [TB] pinHole.  `calibration` names a file of OpenCV, Kalibr, ROS or EuRoC instead: docs/cameras.md.
 
     >>> eye = km.Mount(km.sensors.PinHole(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
     >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
