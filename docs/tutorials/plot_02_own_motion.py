@@ -47,7 +47,7 @@ class TwoTracks:
 # Its uncertainty without a map
 # -----------------------------
 #
-# A turn to the left, without any observation: the covariance grows.
+# A turn to the left, without any observation: the covariance grows. The ellipses have three sigmas.
 slam = km.Slam(km.Robot("crawler", TwoTracks(gauge_m=0.4)))
 figure, ax = plt.subplots(figsize=(6, 4), layout="constrained")
 for k in range(41):
@@ -55,9 +55,9 @@ for k in range(41):
     if k % 8 == 0:
         mean, P = slam.mean("crawler"), slam.covariance("crawler")
         ax.plot(*mean[:2], "k.")
-        ax.plot(*km.geometry.ellipse(mean[:2], P[:2, :2], sigmas=3, points=40).T)
-ax.set_aspect("equal")
-ax.set(xlabel="x (m)", ylabel="y (m)")
+        ax.plot(*km.geometry.ellipse(mean[:2], P[:2, :2], sigmas=3, points=40).T, label=f"after {0.5 * k:g} s")
+figure.legend(loc="outside right center")
+ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 # %%
 # Check it

@@ -21,7 +21,8 @@ log = simulate(world, seed=1)
 # Nearest neighbour and the automatic choice
 # ------------------------------------------
 #
-# Two of the methods of :doc:`/association`. In a configuration: ``association: {type: auto}``.
+# Two of the methods of :doc:`/association`. Orange are the landmarks at 3 sigma, blue is the path. In a configuration:
+# ``association: {type: auto}``.
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.5), layout="constrained", sharex=True, sharey=True)
 choices = {"nearest": km.association.NearestNeighbour(), "auto": km.association.Automatic()}
 for ax, (name, association) in zip(axes, choices.items(), strict=True):

@@ -17,9 +17,9 @@ places have a density that can be approximated by one.
 # One wedge, and two
 # ------------------
 #
-# The density is scaled to 1 at its largest, with the values of [T]'s figure 1: :math:`\phi = \pi/3`, :math:`\sigma^2
-# = 0.01`. On the right, it is multiplied by that of a second bearing. The ellipse of 2 sigma is that of the
-# intersection, propagated by its Jacobians.
+# The density is scaled to 1 at its largest, with the values of [T]'s figure 1: :math:`\phi = \pi/3`, :math:`\sigma^2 =
+# 0.01`. On the right, it is multiplied by that of a second bearing. Triangles are the sensors. The ellipse of 2 sigma
+# is that of the intersection, propagated by its Jacobians.
 import matplotlib.pyplot as plt
 import numpy as np
 

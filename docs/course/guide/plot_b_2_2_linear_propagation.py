@@ -48,8 +48,9 @@ plt.show()
 # The pictures
 # ------------
 #
-# The rotation keeps the semi-axes, the shear mixes the two numbers, and the projection makes the ellipse a line: then
-# :math:`Y` has no inverse, although :math:`P` has one.
+# Blue are the draws, red the ellipses of 1, 2 and 3 sigma of :math:`Y`. The rotation keeps the semi-axes, the shear
+# mixes the two numbers, and the projection makes the ellipse a line: then :math:`Y` has no inverse, although :math:`P`
+# has one.
 
 # %%
 # Try changing

@@ -41,8 +41,9 @@ print("weights", weights.round(3), "average", x.round(3), "drawn:", np.bincount(
 # What each way keeps
 # -------------------
 #
-# The best matching has a small covariance, and is wrong with the probability 0.36. A drawn one has too; the width of
-# the lines is its probability. The covariance of the average holds both places, though its mean is at neither.
+# Dotted is the position before, red after, at 2 sigma; crosses are the landmarks. The best matching has a small
+# covariance, and is wrong with the probability 0.36. A drawn one has too; the width of the lines is its probability.
+# The covariance of the average holds both places, though its mean is at neither.
 figure, axes = plt.subplots(1, 3, figsize=(11, 3.8), layout="constrained", sharey=True)
 ways = list(zip(each, weights, strict=True))
 shown = {"the best": [(each[weights.argmax()], 1)], "drawn": ways, "the average": []}

@@ -45,9 +45,9 @@ print(run)
 # The estimate and its error
 # --------------------------
 #
-# Left: the path from above, as estimated and as it was. Right: the error of the position; the band is 3 sigma. The
-# camera measures no distance, but the odometry does, so the map has its scale. ``kalmark view`` shows the map in 3D,
-# to be turned with the mouse.
+# Left: the path from above, as estimated and as it was. Right: the error of the position; the thin lines are 3
+# sigma. The camera measures no distance, but the odometry does, so the map has its scale. ``kalmark view`` shows the
+# map in 3D, to be turned with the mouse.
 mean, truth = run.history.mean[:, :3], log.truth["robot"].poses[1:, :3]
 sigma = np.sqrt(np.diagonal(run.history.covariance, axis1=1, axis2=2)[:, :3])
 figure, (ax, error) = plt.subplots(1, 2, figsize=(10, 4.4), layout="constrained")
