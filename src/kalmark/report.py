@@ -129,6 +129,9 @@ def _rejected(seen: Observation, gate: float, Z: Array) -> Observation:
     return seen._replace(outcome="rejected", reason=far)
 
 
+ELSEWHERE = "elsewhere"  # the kind of a gap in which a robot was carried
+
+
 class Gap(NamedTuple):
     """A time without controls of a robot, so far: `kind` is "increments" (lost) or "held" (a velocity for too long).
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2
@@ -21,10 +19,9 @@ from kalmark.association.global_start import (
     refine_pose,
     search,
 )
-from kalmark.association.relocalization import align_points, is_same_pose, relocalize
+from kalmark.association.relocalization import align_points, is_same_pose
 from kalmark.geometry.frames import to_frame
 from kalmark.tracks.known_landmarks import Known
-from matched_points import Asked, Points
 
 PLACES = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [9.0, 1.0], [5.0, 8.0], [-6.0, 3.0]])
 T = np.array([1.0, -2.0, 0.7])
@@ -118,25 +115,3 @@ def test_a_scan_that_does_not_determine_a_pose_is_refused_with_the_reason() -> N
     assert search(known(PLACES), elsewhere, SIGMA[:3]) == "no pose in the known map explains its scan"
     strange = np.vstack([to_frame(T, PLACES[:3])[0], [[50.0, 50.0], [70.0, -40.0], [-60.0, 33.0]]])
     assert search(known(PLACES), strange, SIGMA) == "at most 3 of its 6 observations agree with a pose in the known map"
-
-
-def asked(places: np.ndarray, v: np.ndarray, ids: Any = None) -> Any:
-    """Return the question of a scan of positions v (K, 2) from the sensor, of landmarks called 0, 1, ..."""
-    return Asked(Points(v, places), [*range(len(places))], ids)
-
-
-def test_a_scan_relocalises_by_its_ids_or_by_its_distances_alone() -> None:
-    v = to_frame(T, PLACES)[0]
-    for ids in ((0, 1, 2, 3, 4, 5), (0, 1, 2, "strange", "strange", "strange"), None):
-        np.testing.assert_allclose(relocalize(asked(PLACES, v, ids)), T, atol=1e-9)
-
-
-def test_a_scan_that_fits_nowhere_in_two_places_or_by_half_relocalises_nothing() -> None:
-    v = to_frame(T, PLACES)[0]
-    assert relocalize(asked(PLACES, v, (1, 0, 2, 3, 4, 5))) is None, "ids that are exchanged do not fit"
-    assert relocalize(asked(PLACES, v, (0, 1, "s", "s", "s", "s"))) is None, "two are too few"
-    square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
-    assert relocalize(asked(square, to_frame(T, square)[0])) is None, "it fits from four places"
-    strange = np.array([[50.0, 50.0], [70.0, -40.0], [-60.0, 33.0]])
-    assert relocalize(asked(PLACES, np.vstack([v[:3], strange]))) is None, "half of it is strange"
-    np.testing.assert_allclose(relocalize(asked(PLACES, np.vstack([v[:4], strange]))), T, atol=1e-9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,13 @@ def test_places_of_which_one_has_landmarks_that_the_other_has_not_are_two() -> N
     assert found(slam) == []
 
 
+@pytest.fixture
+def never_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no robot be found by its landmarks after a gap."""
+    monkeypatch.setattr("kalmark.slam.elsewhere.ODDS", math.inf)
+
+
+@pytest.mark.usefixtures("never_found")
 def test_a_hall_mapped_twice_is_reported_with_its_time_and_drawn(tmp_path: Path) -> None:
     run = mapped(hall(1, gap_s=4.0), gaps="ignore")
     summary = run.evaluate()
@@ -112,6 +120,7 @@ def test_a_repeat_is_merged_in_every_map_by_every_estimator(estimator: km.estima
     assert right(run, log)
 
 
+@pytest.mark.usefixtures("never_found")
 def test_a_report_has_the_repeats_that_are_not_merged_and_a_saved_map_resumes_bit_for_bit(tmp_path: Path) -> None:
     log, slams = hall(0, gap_s=4.0), []
     for repeats_ in ("warn", "merge"):

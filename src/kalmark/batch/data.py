@@ -82,7 +82,7 @@ class BatchInput:
     `biases` are the constants (c,) of the controls of a robot.
 
     With `segments` (J, 2), from and to in ns, the events between them are left out, and so is how a robot came from one
-    to the next.
+    to the next.  `carried` are the times, in ns, by which a robot had come elsewhere in an unknown way.
     """
 
     robots: Mapping[str, Robot]
@@ -101,6 +101,7 @@ class BatchInput:
     huber: float = np.inf
     biases: Mapping[str, Array] = field(default_factory=dict)
     segments: Ints | None = None
+    carried: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def seen_by(self, sensor: Sensor) -> Landmark:
         """Return what a landmark is to a sensor: in a map with walls a point is the first two of three numbers."""
@@ -128,6 +129,7 @@ class BatchReplay:
         self.fixed = 0  # fixes so far, with those that do not count
         self.nodes: list[int] = []
         self.segment: dict[str, int] = {}  # that a robot is in
+        self.moved: dict[str, int] = {}  # how often it was carried until now
         self.varies: dict[tuple[str, str], bool] = {}  # whether the noise of a sensor does
         self.rows: dict[int, list[int]] = {}
         for row, scan in enumerate(given.associations.scan.tolist()):
@@ -176,6 +178,10 @@ class BatchReplay:
     def _counts(self, event: Event) -> bool:
         """Return whether an event is in one of the segments; where a robot comes to the next one it is lost."""
         segments = self.given.segments
+        moved = sum(t_ns <= event.t_ns for t_ns in self.given.carried.get(event.robot, ()))
+        if self.moved.get(event.robot, 0) != moved:
+            self.moved[event.robot] = moved
+            self.chain.lose(event.robot)
         if segments is None:
             return True
         at = int(np.searchsorted(segments[:, 0], event.t_ns, side="right")) - 1

@@ -46,9 +46,9 @@ class Controls:
         self.interval_s = float(np.median(np.diff(self.t_s) / share[1:])) if len(mine) > 1 else 0.0
         self.usual = np.quantile(np.abs(self.u), USUAL, axis=0) if mine else np.zeros(0)
 
-    def odd(self, t_s: float) -> OddControl | None:
-        """Return the control near a time of the log that is far larger than the others, None if none is."""
-        near = np.flatnonzero(np.abs(self.t_s - t_s) <= NEAR_S)
+    def odd(self, t_s: float, lasts_s: float = 0.0) -> OddControl | None:
+        """Return the control near a time of the log, or in so long, that is far larger than the others, if one is."""
+        near = np.flatnonzero((self.t_s >= t_s - NEAR_S) & (self.t_s <= t_s + lasts_s + NEAR_S))
         if not len(near):
             return None
         times = np.abs(self.u[near]) / np.maximum(self.usual, 1e-300) * (self.usual > 0)
@@ -56,8 +56,8 @@ class Controls:
         if times[row, column] < TIMES:
             return None
         k = int(near[row])
-        lasts_s = 1.0 if self.columns[column].endswith("ps") else self.interval_s
-        value, most = float(self.u[k, column]), float(self.usual[column]) / max(lasts_s, 1e-9)
+        per_s = 1.0 if self.columns[column].endswith("ps") else self.interval_s
+        value, most = float(self.u[k, column]), float(self.usual[column]) / max(per_s, 1e-9)
         return OddControl(float(self.t_s[k]), self.columns[column], value, float(times[row, column]), most)
 
 

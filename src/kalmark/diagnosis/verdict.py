@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -28,9 +29,10 @@ from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
 from kalmark.diagnosis.turned_mounts import TURNED
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
+from kalmark.report import ELSEWHERE as CARRIED
 from kalmark.results.batch import filter_only_sensors, filtered_map
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst_status
-from kalmark.results.control_gaps import RULED_OUT, controls_left_out, is_reported, stayed_lost
+from kalmark.results.control_gaps import KINDS, carried_line, controls_left_out, is_reported, stayed_lost
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import RelocatedRobot
@@ -39,6 +41,7 @@ from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict_text import INNOVATIONS, NO_BATCH, NO_LANDMARKS, NO_MAP
 from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, signs, window_warnings, words_of
+from kalmark.slam.elsewhere import ODDS
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
@@ -55,6 +58,7 @@ SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 TINY_M = 1e-12
 SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to associations comes after it
+LEAST_S = 5.0  # for which a robot is lost at the end
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped again because of it
 MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
 JUMP = "odometry_jump"  # the cause of controls that state a motion that did not take place
@@ -173,7 +177,12 @@ def _with_signs(run: Run, verdict: Verdict) -> Verdict:
     misfit = (sign.status for _, sign in at_end if sign.status != UNCHECKED)
     status = worst_status(verdict.map, *(sign.status for sign in found), *misfit)
     robots = {
-        name: worst_status(status, verdict.robots.get(name, OK), *(s.status for of, s in at_end if of == name))
+        name: worst_status(
+            status,
+            verdict.robots.get(name, OK),
+            *(s.status for of, s in at_end if of == name),
+            *(DOUBTFUL for _ in run.history.carried(name)),
+        )
         for name in run.history.robots
     }
     if not {*run.landmarks.ids} - {*run.landmarks.exact}:
@@ -348,6 +357,7 @@ def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
     return [
         *find_kidnaps(run, log),
         *gaps(run),
+        *_carried(run, log),
         *cause_of_repeats(run.summary),
         *split_landmarks(run),
         *unseen_landmarks(run),
@@ -396,6 +406,14 @@ def _lost(run: Run) -> Iterator[Cause]:
         evidence += "it is not where the path says, or they are wrong"
         cure = "look at what its controls and these say from then on, or state more noise"
         yield Cause("lost", one.since_s, 0.5 * MOST_D2 * one.number, evidence, cure)
+    state, end_s = run.final_slam().state, float(run.history.t_ns.max(initial=0)) * 1e-9
+    for robot, of in state.evidence.items():
+        since_s, number = max(of.since_ns * 1e-9, begin_s(run)), count(len(of.missed), "landmark")
+        lasts = end_s - since_s >= LEAST_S and not state.moving[robot].held.is_adrift
+        if of.ratio <= -math.log(ODDS) and lasts:
+            evidence = f"{robot} does not see {number} where it should from t={since_s:.1f} s on: it is elsewhere"
+            cure = "look at what moved it then, which its controls do not say"
+            yield Cause("lost", since_s, -of.ratio, evidence, cure)
 
 
 def _left_out_until(run: Run, placed: Sequence[RelocatedRobot]) -> float:
@@ -522,7 +540,7 @@ def gaps(run: Run) -> list[Cause]:
     Not if a place that was mapped before it is mapped again after it: then the robot was lost.
     """
     summary, found = run.summary, []
-    stops = [gap for gap in summary.get("gaps", ()) if gap["kind"] != RULED_OUT]
+    stops = [gap for gap in summary.get("gaps", ()) if gap["kind"] in KINDS]
     for gap in (gap for gap in stops if gap["action"] == "ignore" or is_reported(gap)):
         lasts, bridged = gap["end_s"] - gap["start_s"], gap["action"] == "widen" and gap["known_s"] is not None
         anew = any(_mapped_again(run, part, gap["start_s"]) for part in summary.get("repeats", ()))
@@ -534,6 +552,22 @@ def gaps(run: Run) -> list[Cause]:
         cure = cure or ("--set upkeep.repeats=merge" if anew else "")
         found.append(Cause("gap", gap["start_s"], lasts, evidence, cure, bridged and not anew))
     return found + [Cause(JUMP, begin_s, 0.0, line, "", True) for begin_s, line in controls_left_out(summary)]
+
+
+def _carried(run: Run, log: Log) -> Iterator[Cause]:
+    """Yield the robots that were elsewhere and found: from the start, by a control, or carried.  It does no harm."""
+    for gap in run.summary.get("gaps", ()):
+        if gap["kind"] == CARRIED:
+            since_s, told = gap["start_s"], (carried_line(gap), "")
+            odd = _controls(run, log, gap["robot"]).odd(since_s, gap["end_s"] - since_s)
+            name = "start" if since_s <= begin_s(run) else "kidnapped"
+            if odd is not None:
+                name, since_s, told = (
+                    JUMP,
+                    odd.t_s,
+                    odd_control_text(Finding(JUMP, (gap["robot"], ""), 0.0, 0.0, 0.0), odd),
+                )
+            yield Cause(name, since_s, math.log(ODDS), *told, True)
 
 
 def _mapped_again(run: Run, part: dict[str, Any], t_s: float) -> bool:

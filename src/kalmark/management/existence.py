@@ -20,7 +20,7 @@ Beta-binomial: Gelman et al., Bayesian Data Analysis 5.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -31,6 +31,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.management.upkeep import Upkeep
 from kalmark.tracks.channel import Channel, ObservationModel
+from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.looks import Looks, cells_of
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track, Tracks
@@ -60,12 +61,27 @@ def concerns(scan: ScanContext, upkeep: Upkeep) -> bool:
     return hidden and scan.channel.has_limits
 
 
-def count_misses(scan: ScanContext, upkeep: Upkeep) -> list[Track]:
-    """Count what a scan saw of what was expected; return the landmarks that it missed."""
+class Look(NamedTuple):
+    """The landmarks that a scan was `seen` to show, and those it `missed`, with what each miss counts.
+
+    `density` is that of the landmarks about the sensor, per m^2, and `usual` that most of what it observed is mapped.
+    """
+
+    seen: set[Id]
+    missed: dict[Id, float]
+    density: float
+    usual: bool
+
+
+def look(scan: ScanContext, upkeep: Upkeep) -> Look | None:
+    """Return what a scan saw of what was expected, and count it; None if it is no look of its own.
+
+    A scan of which most is not mapped is not counted: its robot may be elsewhere, or its sensor covered.
+    """
     tracks, pose = scan.tracks, scan.pose()
     looks, stated = tracks.looks.setdefault(scan.key, Looks()), upkeep.p_detect is not None
     if not looks.is_due(pose, tracks.changes) and not stated:
-        return []
+        return None
     made = scan.report.observations
     seen, left, fused = set[Id](), list[int](), 0
     for o in made:
@@ -74,31 +90,39 @@ def count_misses(scan: ScanContext, upkeep: Upkeep) -> list[Track]:
             left.append(o.index)
         if o.landmark is not None and o.outcome != "new":
             seen.add(o.landmark)
-    if not stated and (fused == 0 or 2 * fused < len(made)):  # it may be elsewhere, or covered
-        return []
-    begun = {o.landmark for o in made if o.outcome == "new"} if fused < len(made) else set()
-    far, missed = looks.scale_m, list[Track]()
-    for model, near in _nearest_landmarks(scan):
-        names = [name for name in near if name not in begun] if begun else near
-        v = model.landmark.seen_from(pose, scan.map.means(tracks.slots_of(names), model.d))[0]
+    usual = stated or (fused > 0 and 2 * fused >= len(made))
+    begun = {o.landmark for o in made if o.outcome == "new" and o.landmark is not None}
+    far, missed, ranges = looks.scale_m, dict[Id, float](), [np.zeros(0)]
+    for model, near, l in _nearest_landmarks(scan, begun):
+        v = model.landmark.seen_from(pose, l)[0]
+        ranges.append(np.sqrt((v[:, : scan.dimensions] ** 2).sum(axis=1)))
         sure = _surely(scan.channel, v)
-        names, v = [names[i] for i in np.flatnonzero(sure).tolist()], v[sure]
-        r, bearing = np.sqrt((v[:, : scan.dimensions] ** 2).sum(axis=1)), np.arctan2(v[:, 1], v[:, 0])
+        names, v, r = [near[i] for i in np.flatnonzero(sure).tolist()], v[sure], ranges[-1][sure]
+        bearing = np.arctan2(v[:, 1], v[:, 0])
         there, hidden = np.array([name in seen for name in names], dtype=np.bool_), _hidden(scan, r, bearing)
         clear = there | ~_unclear(scan, model, names, v, ~there, left)
         cells = cells_of(r, bearing, hidden)
         weights = np.where(hidden, 0.0, 1.0) if stated else looks.weights(cells)
-        looks.count(cells[clear], there[clear])
         far = float(r[there].mean()) if there.any() else far
-        for i in np.flatnonzero(clear & ~there & (weights > 0.0)).tolist():
-            missed.append(tracks.confirmed[names[i]])
-            missed[-1].missed += float(weights[i])
-    for name in seen:
-        track = tracks.confirmed.get(name)
-        if track is not None:
+        if usual:
+            looks.count(cells[clear], there[clear])
+        missed |= {names[i]: float(weights[i]) for i in np.flatnonzero(clear & ~there & (weights > 0.0)).tolist()}
+    if usual:
+        looks.take(pose, tracks.changes, far)
+    r = np.concatenate(ranges)
+    return Look(seen, missed, len(r) / (math.pi * max(float(r.max(initial=0.0)), far) ** 2), usual)
+
+
+def count_misses(tracks: Tracks, look: Look) -> list[Track]:
+    """Count the sightings and the misses of the landmarks of a look; return those that it missed."""
+    missed = [tracks.confirmed[name] for name in look.missed if name in tracks.confirmed]
+    for track in missed:
+        track.missed += look.missed[track.id]
+    for name in look.seen:
+        if name in tracks.confirmed:
+            track = tracks.confirmed[name]
             track.seen, track.absent, track.missed = track.seen + 1, track.absent + track.missed, 0.0
     tracks.looked += 1
-    looks.take(pose, tracks.changes, far)
     return missed
 
 
@@ -181,16 +205,34 @@ def _counts(tracks: Sequence[Track]) -> tuple[Array, Array, Array]:
     return found[:, 0], found[:, 1], found[:, 2]
 
 
-def _nearest_landmarks(scan: ScanContext) -> list[tuple[ObservationModel, list[Id]]]:
-    """Return the landmarks nearest to the sensor, those of one kind together, that are points."""
-    tracks, channel = scan.tracks, scan.channel
+def _nearest_landmarks(scan: ScanContext, begun: Set[Id]) -> list[tuple[ObservationModel, list[Id], Array]]:
+    """Return the landmarks nearest to the sensor, those of one kind together, that are points, and their means (K, n).
+
+    Those that have `begun` with this scan are left out.
+    """
+    tracks, channel, known = scan.tracks, scan.channel, list[Id]()
     if channel.gives_places:
-        sorts = tracks.sorts_of(channel.points, len(scan.map.blocks))
-        found = scan.map.around(sorts, scan.pose()[: scan.dimensions], AROUND)
-        names = [tracks.names[slot] for slot in found.tolist()]
+        sorts, place = tracks.sorts_of(channel.points, len(scan.map.blocks)), scan.pose()[: scan.dimensions]
+        around = (tracks.names[slot] for slot in scan.map.around(sorts, place, AROUND).tolist())
+        names = [name for name in around if name not in begun]
+        known = tracks.known.near(channel.models, place[None], AROUND)
     else:
         names = [name for name in tracks.observable(channel) if tracks.confirmed[name].model.kind in channel.points]
-    return [(model, [names[i] for i in rows]) for model, rows in tracks.by_model(channel, names)] if names else []
+    mapped = [(model, [names[i] for i in rows]) for model, rows in tracks.by_model(channel, names)] if names else []
+    exact = [(model, [known[i] for i in rows]) for model, rows in tracks.known_by_model(channel, known)]
+    return [
+        *((model, of, scan.map.means(tracks.slots_of(of), model.d)) for model, of in mapped),
+        *((model, of, tracks.known.means(of)) for model, of in exact),
+    ]
+
+
+def expected(scan: ScanContext, of: Known) -> list[Id]:
+    """Return those of landmarks of one kind that are surely in view, and not behind what was observed."""
+    rows, pose = of.nearest(scan.pose()[None, : scan.dimensions], AROUND), scan.pose()
+    v = of.model.seen_from(pose, of.values[rows])[0]
+    r, bearing = np.sqrt((v[:, : scan.dimensions] ** 2).sum(axis=1)), np.arctan2(v[:, 1], v[:, 0])
+    sure = _surely(scan.channel, v) & ~_hidden(scan, r, bearing)
+    return [of.names[row] for row in rows[sure].tolist()]
 
 
 def _unclear(
@@ -198,7 +240,7 @@ def _unclear(
 ) -> Flags:  # fmt: skip
     """Return which of the `missed` landmarks v (K, d) one of the observations `left`, of no landmark, may be of."""
     out = np.zeros(len(names), dtype=np.bool_)
-    if not left or not missed.any():
+    if not left or not missed.any() or names[0] in scan.tracks.known:
         return out
     if not scan.channel.gives_places:
         near = {c.landmark for c in scan.report.candidates if c.d2 <= scan.channel.gate}

@@ -20,6 +20,7 @@ from kalmark.batch.reassociation import ROUNDS, Reassociated, reassociate
 from kalmark.batch.solver import Batch, optimum
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Id, Scan
+from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.frames3d import from_frame, minus
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.logs.progress import track
@@ -155,7 +156,7 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
     robots = slam.robots
     landmarks = filtered_map(run)
     ids = {str(id_): id_ for id_ in landmarks} | {name: name for name in robots}
-    fused = np.flatnonzero(history.fused)
+    fused = np.flatnonzero(history.fused & ~_misplaced(history))
     rows = _of_places(history, slam, fused if rows is None else rows)
     fused = _of_places(history, slam, fused)
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
@@ -188,15 +189,27 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
         starts={start.robot: _start(start, again.get(start.robot)) for start in history.starts},
         fixes=len(run.history.fixes),
         left_out=rejected,
+        carried={name: tuple(gap.start_ns for gap in history.carried(name)) for name in robots},
     )
 
 
+def _misplaced(history: History) -> Flags:
+    """Return which observations (O,) were made while their robot was elsewhere than the filter had it."""
+    lost = [history.while_carried(gap)[history.step] for gap in history.carried()]
+    return np.any([np.zeros(len(history.step), dtype=np.bool_), *lost], axis=0)
+
+
 def _moved(history: History, again: Mapping[str, Restart]) -> Array:
-    """Return the poses (S, .) of a run, those before the map was moved onto its fixes moved with it."""
+    """Return the poses (S, .) of a run, those before the map or the robot was moved to where it is, moved with it."""
     poses = history.poses.copy()
     for robot, restart in again.items():
         before = (history.robot == robot) & (history.t_ns <= restart.t_ns)  # a fix follows the scans of its time
         poses[before] = restart.onto.poses(poses[before])
+    for gap in history.carried():
+        lost, found = np.flatnonzero(history.while_carried(gap)), np.searchsorted(history.t_ns, gap.end_ns)
+        before = poses[lost].copy()
+        for step, pose in zip(lost, before, strict=True):
+            poses[step] = compose(poses[found], compose(inverse(before[-1])[0], pose)[0])[0]
     return poses
 
 

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Flags
-from kalmark.report import Gap
+from kalmark.report import ELSEWHERE, Gap
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.history import History
 from kalmark.results.recording import Recording
 
 KNOWN = 0.5  # of the sigma that a gap gave it, below which the position is known again
 RULED_OUT = "ruled_out"  # the kind of a gap that is made: of controls beyond the limits of their robot
+KINDS = "held", "increments"  # of gaps in the controls
 NOTED, NOTED_S = 0.2, 0.5  # of a metre or a radian, sigmas above which a longer gap is worth a line
 
 
@@ -85,6 +86,13 @@ def stayed_lost(gap: dict[str, Any]) -> bool:
     return gap["action"] == "widen" and gap["known_s"] is None and is_reported(gap)
 
 
+def carried_line(gap: Mapping[str, Any]) -> str:
+    """Return that a robot came elsewhere in an unknown way, and where and when it was found."""
+    moved = f"{figure(gap['sigma_m'])} m and {figure(float(np.degrees(gap['sigma_rad'])), 2)} deg"
+    since = f"{gap['robot']} was elsewhere from t={gap['start_s']:.1f} s on"
+    return f"{since}: its landmarks placed it {moved} away at t={gap['end_s']:.1f} s"
+
+
 def controls_left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
     """Yield of each robot the time, s of the log, and a line of the controls that were beyond its limits."""
     odd = [gap for gap in summary.get("gaps", ()) if gap["kind"] == RULED_OUT]
@@ -100,7 +108,8 @@ def controls_left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]
 def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
     """Yield a line a robot of the gaps that were bridged, and of controls that were left out."""
     yield from (line for _, line in controls_left_out({"gaps": gaps}))
-    noted = [gap for gap in gaps if is_reported(gap) and gap["kind"] != RULED_OUT]
+    yield from (carried_line(gap) for gap in gaps if gap["kind"] == ELSEWHERE)
+    noted = [gap for gap in gaps if is_reported(gap) and gap["kind"] in KINDS]
     for robot in dict.fromkeys(gap["robot"] for gap in noted):
         mine = [gap for gap in noted if gap["robot"] == robot]
         longest = max(mine, key=lambda gap: gap["end_s"] - gap["start_s"])

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id, list_names
-from kalmark.report import Gap
+from kalmark.report import ELSEWHERE, Gap
 
 __all__ = [
     "Biased", "CalibratedMount", "Camera", "Controlled", "History", "LandmarkChange", "MapSnapshot", "Measuring",
@@ -394,6 +394,14 @@ class History:
     def localizes(self) -> bool:
         """True if each sensor that made observations read its own robot: no landmark is to be expected."""
         return len(self.sensor) > 0 and {*self.sensor.tolist()} == {*self.sensor[self.of_own].tolist()}
+
+    def carried(self, *robots: str) -> list[Gap]:
+        """Return when robots, or some of them, were elsewhere than the filter had them, until it found them."""
+        return [gap for gap in self.gaps if gap.kind == ELSEWHERE and (not robots or gap.robot in robots)]
+
+    def while_carried(self, gap: Gap) -> Flags:
+        """Return which steps (S,) are of a robot that was elsewhere."""
+        return (self.robot == gap.robot) & (self.t_ns >= gap.start_ns) & (self.t_ns < gap.end_ns)
 
     @property
     def in_space(self) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from kalmark.events import Id, Scan
 from kalmark.filter.estimators import Update
 from kalmark.report import JudgedScan, Report
-from kalmark.slam import moves, tentative
+from kalmark.slam import elsewhere, moves, tentative
 from kalmark.slam.checks import measurements
 from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy
@@ -27,7 +27,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     """Correct the map by a scan whose policy is `by_ids`; None of a scan of which something is to be decided."""
     tracks, name, ids = state.tracks, event.robot, cast("tuple[Id, ...]", event.ids)
     moving = state.moving[name]
-    waiting = tracks.tentative or state.clones.clones or state.surveys.misfits or state.sums
+    waiting = tracks.tentative or state.clones.clones or state.surveys.misfits or state.sums or state.evidence
     if not ids or moving.held.is_adrift or waiting:
         return None
     seen, kinds = [track for track in map(tracks.confirmed.get, ids) if track], set(map(tracks.sorts.get, ids))
@@ -40,21 +40,21 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     report.gaps, slots = moves.advance(state, name), tracks.slots_of(ids)
     if state.repeats((name, event.sensor), event.t_ns, event.y, event.ids):
         return record_repeated_reading(report, ids, channel.dof)
-    parallax = not channel.finds_depth
-    done = state.corrected(
-        Update(model.model, moving.slot, channel.mount, slots, model.d, event.y, R, channel.gate, parallax), event
+    update = Update(
+        model.model, moving.slot, channel.mount, slots, model.d, event.y, R, channel.gate, not channel.finds_depth
     )
+    scan = ScanContext(state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report)
+    done = elsewhere.correct(state, scan, ids, update)
     report.e, report.z, report.Z, _, fused, _ = done
     for track, used in zip(seen, fused.tolist(), strict=True):
         track.observations += used
     if policy.contests and not fused.all():
-        scan = ScanContext(
-            state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report
-        )  # fmt: skip
         group = JudgedScan(range(len(ids)), ids, ids, done, channel.gate)
         tentative.contest(state, scan, model, group, ~fused & ~np.isnan(done.d2), policy.upkeep.odds)
     if report.gaps and fused.any():
         moving.held.located(event.t_ns)
     report.judged = (JudgedScan(range(len(ids)), ids, ids, done, channel.gate),)
+    if state.evidence:
+        elsewhere.weigh(state, scan, None)
     state.let_grow()
     return report

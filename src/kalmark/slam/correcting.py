@@ -17,7 +17,7 @@ from kalmark.geometry.gaussian import gate
 from kalmark.management import ambiguous_tags, measured_depths
 from kalmark.management.attention import select_observations
 from kalmark.report import INDEFINITE, JudgedScan, Observation
-from kalmark.slam import surveyed_corrections, tentative
+from kalmark.slam import elsewhere, surveyed_corrections, tentative
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import ObservationModel
@@ -53,7 +53,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         done = (
             surveyed_corrections.correct_by_surveys(state, scan, names, update, least, state.estimator, approach)
             if on_trial
-            else state.corrected(update, scan.event)
+            else elsewhere.correct(state, scan, names, update)
         )
         report.fill(rows, done)
         judged.append(JudgedScan(rows, scan.ids, names, done, min(scan.channel.gate, least)))

@@ -8,8 +8,7 @@ linearisation does not hold over the robot's covariance until it holds over that
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,9 +16,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.association.global_start import FEWEST, Located, locate_sensor
-from kalmark.association.protocol import Decision
 from kalmark.association.query import Query
-from kalmark.association.relocalization import relocalize
 from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.geometry import frames3d
@@ -210,37 +207,12 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     state.clones.forget_current(name)
 
 
-def decide(
-    state: State, scan: ScanContext, query: Query, decide: Callable[[Query], Sequence[Decision]]
-) -> tuple[Query, Sequence[Decision]]:
-    """Return the query and the decisions on a scan; a robot adrift is moved first.
-
-    It is moved to where its scan fits, and stays there if the association recognises a landmark from there.
-    """
-    T = _fitting(state, scan, query)
-    if T is None:
-        return query, decide(query)
-    before = state.map.mean(scan.robot)
-    _put(state, scan, T)
-    moved = Query(scan)
-    decisions = decide(moved)
-    if not any(name in state.tracks.confirmed or name in state.tracks.known for name, _ in decisions):
-        state.map.set_predicted(scan.robot, before)
-        moved = Query(scan)
-        decisions = decide(moved)
-    return moved, decisions
-
-
-def _fitting(state: State, scan: ScanContext, query: Query) -> Array | None:
-    """Return where the sensor (3,) of a robot adrift is; None of others, or if its scan fits nowhere."""
+def note_adrift(state: State, scan: ScanContext) -> None:
+    """Take note whether a gap leaves the heading of a scan's robot unknown."""
     held = state.moving[scan.event.robot].held
     if held.is_adrift and (len(scan.pose()) != 3 or turn_holds(_covariance(state, scan))):
         held.recovered()
     scan.adrift = held.is_adrift
-    if scan.adrift:
-        with suppress(np.linalg.LinAlgError):
-            return relocalize(query)
-    return None
 
 
 def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:

@@ -13,7 +13,7 @@ from kalmark.management import existence, reparametrize, wall_growth
 from kalmark.management import repeated_places as of_map
 from kalmark.models.protocols import Reparametrizable, Segmented
 from kalmark.report import Observation
-from kalmark.slam import merging, surveyed_corrections, tentative
+from kalmark.slam import elsewhere, merging, surveyed_corrections, tentative
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.scan import ScanContext
@@ -76,12 +76,15 @@ def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
     for name in state.surveys.wrong() if state.surveys.misfits and not state.sums else ():  # else it may be the robot
         state.remove(name)
         report.removed += ((name, surveyed_corrections.ELSEWHERE),)
-    if existence.concerns(scan, policy.upkeep):
+    look = existence.look(scan, policy.upkeep) if existence.concerns(scan, policy.upkeep) else None
+    if look is not None and look.usual:
         for track in existence.absent_landmarks(
-            state.tracks, policy.upkeep, existence.count_misses(scan, policy.upkeep)
+            state.tracks, policy.upkeep, existence.count_misses(state.tracks, look)
         ):
             state.remove(track.id)
             report.removed += ((track.id, f"should be in view and was not seen, {round(track.missed)} scans in a row"),)
+    if elsewhere.concerns(scan):
+        elsewhere.weigh(state, scan, look)
     if ids is None or None in ids:
         merging.merge_seen(state, scan, policy)
         if policy.upkeep.repeats != "off" and of_map.is_due(state.tracks):

@@ -327,7 +327,8 @@ class Slam(Estimate):
             scan.report.observations = located.fates or waits
             return
         if located is None:
-            query, decisions = locating.decide(state, scan, query, lambda query: self._decided(policy, query))
+            locating.note_adrift(state, scan)
+            decisions = self._decided(policy, query)
         else:
             query = Query(scan)
             decisions = self._decided(policy, query, located.decisions)

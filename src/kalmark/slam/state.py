@@ -19,6 +19,7 @@ from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
 from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
+from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import SELDOM, LastMeasurement
@@ -56,7 +57,8 @@ class State:
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
     `standing` are, of robots with detection of rest, the names of the sensors that do; `alternatives` are, of robots
     whose readings do not fit, the other explanations of these; `sums` are, of robots that may be in several places,
-    their poses; `taken` are the events of this very time: the kind, the robot and the sensor of each; `given` is what
+    their poses; `evidence` is that robots are elsewhere;
+    `taken` are the events of this very time: the kind, the robot and the sensor of each; `given` is what
     each sensor gave last; `balance` decides whether a dense map is compressed.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
@@ -73,6 +75,7 @@ class State:
     moving: dict[str, Moving]
     alternatives: dict[str, Alternative]
     sums: dict[str, GaussianSum]
+    evidence: dict[str, Evidence]
     sources: dict[ChannelKey, Source]
     readers: dict[ChannelKey, StateReader]
 
@@ -80,6 +83,7 @@ class State:
         self.settings, self.robots, self.t_ns, self.taken, self.placed = settings, robots, None, set(), 0
         self.map, self.balance, self.tracks = new_map(settings.map, settings.numbers), CostBalance(), Tracks(robots)
         self.clones, self.surveys, self.given, self.alternatives, self.sums = Clones(), Surveys(), {}, {}, {}
+        self.evidence = {}
         self.moving, self.sources, self.readers = {}, {}, {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}

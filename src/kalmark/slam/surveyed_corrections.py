@@ -12,6 +12,7 @@ from kalmark.arrays import Array
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate
+from kalmark.slam import elsewhere
 from kalmark.slam.locating import can_be_summed, is_doubted
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
@@ -50,13 +51,13 @@ def correct_by_surveys(
     """
     if least == math.inf:
         return state.corrected(update, scan.event, estimator)
-    done = state.corrected(update._replace(gate=min(update.gate, least)), scan.event, estimator)
+    done = elsewhere.correct(state, scan, names, update._replace(gate=min(update.gate, least)), estimator)
     trial, known = state.surveys.trial, state.tracks.known
     beyond = np.flatnonzero(~done.fused & ~np.isnan(done.d2)).tolist()
     tried = [name in trial or name in known for name in names]
     fitting = [names[k] for k in np.flatnonzero(done.fused & (done.d2 <= least)).tolist()]
     lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
-    if (lost or state.surveys.contradict()) and is_doubted(state, scan):
+    if elsewhere.concerns(scan) or ((lost or state.surveys.contradict()) and is_doubted(state, scan)):
         lost = False
     out = np.array([k for k in beyond if (lost or not tried[k]) and done.d2[k] <= update.gate], dtype=np.int64)
     if not len(out):

@@ -73,8 +73,14 @@ class Looks:
         p = (seen + 0.5) / (expected + 1.0)
         if not seen.any():
             return np.ones(len(p))
-        q = min(float(seen @ p / seen.sum()), MOST)
-        return np.asarray(np.log1p(-np.minimum(p, q)) / math.log1p(-q))
+        log_miss = self.log_miss(part)
+        return np.asarray(np.log1p(-np.minimum(p, -math.expm1(log_miss))) / log_miss)
+
+    def log_miss(self, part: slice = PARTS[0]) -> float:
+        """Return the log probability that a landmark is missed which stands where those are that are seen."""
+        seen, expected = self.counts[:, part]
+        p = (seen + 0.5) / (expected + 1.0)
+        return math.log1p(-min(float(seen @ p / seen.sum()), MOST)) if seen.any() else math.log(0.5)
 
     def count(self, cells: Index, seen: Flags) -> None:
         """Count what was seen (K,) of what was expected in these cells (K, 3)."""

@@ -1,0 +1,83 @@
+"""A robot that is carried away unnoticed: is it found by its landmarks, and when?  One that is not: does it stay?
+
+    python benchmarks/carried.py                       # three fields, with ids and without, 5 seeds
+    python benchmarks/carried.py --worlds dense --runs 20
+
+A piece is cut out of a simulated log, after the robot has been round: its events stop at one place and go on at
+another.  A line a case: runs, robots found (at the end within .5 m of where it is, after the map is moved onto the true
+one), the median and the longest time until then, false alarms of the log without the cut, and maps with a landmark
+twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+
+import numpy as np
+
+import kalmark as km
+from kalmark.config import build_slam
+from kalmark.events import Event
+from kalmark.logs.log import Log
+from kalmark.report import Gap
+from kalmark.results.measures import rigid
+from kalmark.simulate import load_world, simulate
+
+WORLDS = {"random_field": [], "sparse": ["world.count=25"], "dense": ["world.count=120"]}  # and their keys
+STEPS = 1200
+FROM, TO, RIGHT_M = 0.6, 0.75, 0.5  # of the log is cut out
+
+
+def cut(log: Log) -> tuple[list[Event], int, int]:
+    """Return the events without a piece, later ones at earlier times, and the first and the last time of that, ns."""
+    times = np.array([event.t_ns for event in log.events])
+    first, last = (int(times[int(len(times) * share)]) for share in (FROM, TO))
+    events = [event for event in log.events if event.t_ns < first]
+    for event in log.events:
+        if event.t_ns > last and isinstance(event, km.Scan):
+            t_ns = event.t_ns - last + first
+            events.append(km.Scan(t_ns=t_ns, robot=event.robot, sensor=event.sensor, y=event.y, ids=event.ids))
+        elif event.t_ns > last and isinstance(event, km.Control):
+            events.append(km.Control(t_ns=event.t_ns - last + first, robot=event.robot, u=event.u))
+    return events, first, last
+
+
+def carried_runs(keys: list[str], ids: bool, seed: int) -> tuple[bool, list[Gap], list[Gap], int]:
+    """Return whether the robot was found, when it was elsewhere with the cut and without, and landmarks too many."""
+    said = load_world("random_field", [*keys, f"steps={STEPS}", f"ids={str(ids).lower()}"])
+    log = simulate(said, seed=seed)
+    whole = km.record(build_slam(said.config(), log), log, progress=False)
+    events, first, last = cut(log)
+    slam, gaps, robot = build_slam(said.config(), log), list[Gap](), next(iter(log.truth))
+    for event in events:
+        gaps += [gap for gap in slam.process(event).gaps if gap.kind == "elsewhere"]
+    true = log.truth[robot].at(np.array([events[-1].t_ns - first + last]))[0]
+    names, places = [*log.landmarks], np.array([*log.landmarks.values()])[:, :2]
+    mapped = np.array(slam.landmarks().means)[:, :2]
+    near = [int(np.argmin(np.linalg.norm(places - p, axis=1))) for p in mapped]
+    onto = rigid(mapped, places[near])
+    off = np.linalg.norm(onto(slam.mean(robot)[None, :2])[0] - true[:2])
+    return bool(off < RIGHT_M), gaps, whole.history.carried(), max(len(mapped) - len(names), len(near) - len({*near}))
+
+
+def main() -> None:
+    """Print a line a world and kind of association."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--worlds", nargs="+", default=[*WORLDS])
+    args = parser.parse_args()
+    for world, ids in itertools.product(args.worlds, (True, False)):
+        runs = [carried_runs(WORLDS[world], ids, seed) for seed in range(args.runs)]
+        lasts = [gap.lasts_s for _, gaps, _, _ in runs for gap in gaps] or [np.nan]
+        print(
+            f"{world:12} {'ids' if ids else 'no ids':6}: found {sum(found for found, *_ in runs)} of {len(runs)}, "
+            f"after {np.median(lasts):.1f} s, at most {max(lasts):.1f} s; "
+            f"false alarms {sum(len(c) for _, _, c, _ in runs)}; "
+            f"maps with something twice {sum(twice > 0 for *_, twice in runs)}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""A robot that is carried away is found by its landmarks: in its own map or a surveyed one, with ids or without."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kalmark as km
+from kalmark.events import Event
+from kalmark.geometry import compose, inverse
+from kalmark.geometry.angles import wrap
+
+RANGE_M, RATE_HZ = 8.0, 5.0
+
+
+def trees(seed: int, number: int = 60) -> Any:
+    """Return places (N, 2) at least 1 m apart, and from the path, in a field of 30 m by 20 m."""
+    rng, found, way = np.random.default_rng(seed), list[Any](), path(1)[:, :2]
+    while len(found) < number:
+        p = rng.uniform((0.0, 0.0), (30.0, 20.0))
+        if np.linalg.norm(np.array([*found, *way]) - p, axis=1).min() > 1.0:
+            found.append(p)
+    return np.array(found)
+
+
+def path(laps: int) -> Any:
+    """Return poses (S, 3) of so many laps in the field, .1 m and 1/5 s apart."""
+    a = np.linspace(0.0, 2 * np.pi * laps, 550 * laps)
+    x, y = 15.0 + 10.0 * np.cos(a), 10.0 + 6.0 * np.sin(a)
+    return np.column_stack([x, y, np.arctan2(np.gradient(y), np.gradient(x))])
+
+
+def log_of(
+    poses: Any, places: Any, seed: int, ids: bool, jump: int | None = None, skip: int = 0, felled: int | None = None
+) -> list[Event]:
+    """Return increments and scans of trees along poses.
+
+    Before the step `jump` the robot is carried past `skip` poses; a third of the trees falls at the step `felled`.
+    """
+    rng, events = np.random.default_rng(seed), list[Event]()
+    steps = [*range(len(poses))] if jump is None else [*range(jump), *range(jump + skip, len(poses))]
+    for k, (before, now) in enumerate(pairwise(steps)):
+        t_s = (k + 1) / RATE_HZ
+        step = compose(inverse(poses[before])[0], poses[now])[0] if now == before + 1 else np.zeros(3)
+        u = step + rng.normal(0.0, (0.004, 0.002, 0.003))
+        events.append(km.Control(t_s, "rover", u))
+        x, y, theta = poses[now]
+        standing = np.arange(len(places)) % 3 > 0 if felled is not None and k >= felled else np.ones(len(places), bool)
+        d = places - (x, y)
+        r, b = np.hypot(*d.T), wrap(np.arctan2(d[:, 1], d[:, 0]) - theta)
+        seen = np.flatnonzero((r < RANGE_M) & (np.abs(b) < 2.3) & (rng.random(len(r)) < 0.9) & standing)
+        z = np.column_stack([r[seen], b[seen]]) + rng.normal(0.0, (0.05, 0.01), (len(seen), 2))
+        events.append(km.Scan(t_s, "rover", "laser", z, ids=seen.tolist() if ids else None))
+    return events
+
+
+def slam_at(start: Any, ids: bool) -> km.Slam:
+    sensor = km.sensors.RangeBearing(sigma_range_m=0.05, sigma_bearing_rad=0.01, range_max_m=RANGE_M, fov_rad=4.6)
+    motion = km.motion.Odometry2D(sigma_x_m=0.004, sigma_y_m=0.002, sigma_theta_rad=0.003)
+    rover = km.Robot("rover", motion, start=start, sensors={"laser": km.Mount(sensor)})
+    return km.Slam(rover, association=km.association.ByIdentity() if ids else km.association.Automatic())
+
+
+def errors(slam: km.Slam, events: list[Event], poses: Any) -> tuple[Any, list[Any]]:
+    """Return the distances (S,) of a robot from its path after each scan, and how it was carried."""
+    off, carried = [], list[Any]()
+    for event in events:
+        report = slam.process(event)
+        carried += [gap for gap in report.gaps if gap.kind == "elsewhere"]
+        if isinstance(event, km.Scan):
+            off.append(slam.mean("rover")[:2])
+    return np.linalg.norm(np.array(off) - poses[:, :2], axis=1), carried
+
+
+def carried_log(seed: int, ids: bool) -> tuple[Any, list[Event], Any]:
+    """Return trees, the log of a robot that is carried away in its second lap, and its poses after each scan."""
+    places, poses, jump, skip = trees(seed), path(3), 750, 200
+    there = np.concatenate([poses[1:jump], poses[jump + skip :]])
+    return places, log_of(poses, places, seed, ids, jump, skip), there
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("surveyed", ["no", "exactly", "uncertain"])
+@pytest.mark.parametrize("ids", [True, False])
+def test_a_robot_that_is_carried_away_is_found(ids: bool, surveyed: str, seed: int) -> None:
+    places, events, poses = carried_log(seed, ids)
+    slam = slam_at(path(1)[0], ids)
+    for name, place in enumerate(places) if surveyed != "no" else ():
+        slam.add_landmark(name, place, 1e-4 * np.eye(2) if surveyed == "uncertain" else None)
+    off, carried = errors(slam, events, poses)
+    assert [gap.robot for gap in carried] == ["rover"]
+    assert carried[0].end_ns * 1e-9 < 750 / RATE_HZ + 30.0
+    assert off[:749].max() < 0.8
+    assert off[-300:].max() < 0.8
+    assert len(slam.landmarks()) <= len(places) + 1
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("ids", [True, False])
+def test_a_robot_that_is_not_stays_where_it_is(ids: bool, seed: int) -> None:
+    places, poses = trees(seed), path(2)
+    off, carried = errors(slam_at(poses[0], ids), log_of(poses, places, seed, ids), poses[1:])
+    assert not carried
+    assert off.max() < 0.8
+
+
+def test_trees_that_were_felled_do_not_carry_a_robot() -> None:
+    places, poses = trees(6), path(2)
+    off, carried = errors(slam_at(poses[0], False), log_of(poses, places, 6, False, felled=550), poses[1:])
+    assert not carried
+    assert off.max() < 0.8
+
+
+def test_a_lost_robot_goes_on_from_a_file_bit_for_bit(tmp_path: Any) -> None:
+    _, events, _ = carried_log(1, True)
+    slam = slam_at(path(1)[0], True)
+    at = next(k for k, event in enumerate(events) if slam.process(event) and slam.state.evidence)
+    slam.save(tmp_path / "map.kmk")
+    other = km.Slam.load(tmp_path / "map.kmk")
+    for event in events[at + 1 : at + 200]:
+        slam.process(event)
+        other.process(event)
+    np.testing.assert_array_equal(slam.mean("rover"), other.mean("rover"))
+    assert len(slam.landmarks()) == len(other.landmarks())
