@@ -36,7 +36,7 @@ HALF_BLIND = "sigma_range_m: 0.05, sigma_range_rel: 0.03, range_min_m: 0.5, rang
 WRONG_SCALE = "scale: 1.1, bias_m: 0.05, range_max_m: 8.0"
 CASES: dict[str, tuple[str, list[str]]] = {
     "one new landmark a step": ("cloister", ["steps=60"]),
-    "a range noise that grows": ("loop_b2", ["steps=300"]),
+    "a range noise that grows": ("loop_b2", ["steps=200"]),
     "velocities": (
         DRIVE.format(
             route="{type: wander, turn_radius_m: 0.5}", motion="unicycle", sensor=HALF_BLIND,

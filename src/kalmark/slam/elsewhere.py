@@ -1,9 +1,9 @@
 """A robot that is elsewhere than its filter has it: found by evidence, placed where the log fits better.
 
-A covariance cannot say that a robot was carried away.  The log does (`evidence.py`).  At - log `ODDS` a pose is looked
-for at which the scan, and what was mapped since the onset, is that of old landmarks (`association/global_start.py`).  A
-second filter of the robot alone begins there, an `Alternative`, on the old map as it is, with the same ratio.  Where
-that reaches log `ODDS` the robot is placed there; what was mapped meanwhile goes.
+A covariance does not show that a robot was carried away.  The log does (`evidence.py`).  At - log `ODDS` a pose is
+looked for at which the scan, and what was mapped since the onset, is that of old landmarks
+(`association/global_start.py`).  A second filter of the robot alone begins there, an `Alternative`, on the old map as
+it is, with the same ratio.  Where that reaches log `ODDS` the robot is placed there; what was mapped meanwhile goes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MEANWHILE = "mapped while its robot was elsewhere"
 
 
 def concerns(scan: ScanContext) -> bool:
-    """Return whether a scan can say where its robot is: it finds the places of points in the plane."""
+    """Return whether a scan determines where its robot is: it finds the places of points in the plane."""
     channel = scan.channel
     return channel.gives_places and scan.dimensions == 2 and not channel.joins and channel.landmark.kind == "point"
 
@@ -79,7 +79,7 @@ def correct(
 
 
 def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
-    """Take note of what a scan says of where its robot is, and place it where that is beyond doubt."""
+    """Take note of the landmarks that a scan saw and missed, and place its robot where that is beyond doubt."""
     robot = scan.event.robot
     if look is not None or scan.adrift:
         state.evidence.setdefault(robot, Evidence())
@@ -112,7 +112,8 @@ def _note(scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
         logs = _log_chance(scan, [o.index for o in seen], look.density if look is not None else 0.0)
         of.see((o.landmark for o in seen if o.landmark is not None), -logs, t_ns)
     of.begin((o.landmark for o in made if o.outcome == "new" and o.landmark is not None), t_ns)
-    of.weigh()
+    if look is not None or seen:
+        of.weigh()
 
 
 def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | None = None) -> Array:

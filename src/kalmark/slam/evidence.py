@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 
 from kalmark.events import Id
 
 SURE = 7.0  # the most that one landmark counts: log odds
-MOST = 64  # landmarks that were missed last
+MOST, RECENT = 64, 256  # landmarks that were missed last, and seen last, which outweigh all older ones
 NEVER_NS = -1
 
 
@@ -50,7 +51,7 @@ class Evidence:
     def see(self, names: Iterable[Id], logs: Iterable[float], t_ns: int) -> None:
         """Take note of landmarks that were seen where they are expected."""
         for name, log in zip(names, logs, strict=True):
-            self.seen[name] = self.seen.get(name, (NEVER_NS,))[0], t_ns, min(float(log), SURE)
+            self.seen[name] = self.seen.pop(name, (NEVER_NS,))[0], t_ns, min(float(log), SURE)  # the last one of all
             self.missed.pop(name, None)
 
     def miss(self, names: Iterable[Id], logs: Iterable[float], t_ns: int) -> None:
@@ -70,7 +71,8 @@ class Evidence:
         s = np.unique(np.concatenate([last, first - 1]))
         ratios = logs @ ((last[:, None] <= s) & (s < first[:, None]))
         if self.seen:
-            begun, seen, gains = (np.array(column) for column in zip(*self.seen.values(), strict=True))
+            recent = islice(reversed(self.seen.values()), RECENT)
+            begun, seen, gains = (np.array(column) for column in zip(*recent, strict=True))
             ratios = ratios + gains @ ((begun[:, None] <= s) & (s < seen[:, None]))
         self.ratio, self.since_ns = float(ratios.min()), int(s[np.flatnonzero(ratios == ratios.min())[-1]])
 
