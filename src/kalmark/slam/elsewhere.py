@@ -112,8 +112,7 @@ def _note(scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
         logs = _log_chance(scan, [o.index for o in seen], look.density if look is not None else 0.0)
         of.see((o.landmark for o in seen if o.landmark is not None), -logs, t_ns)
     of.begin((o.landmark for o in made if o.outcome == "new" and o.landmark is not None), t_ns)
-    if look is not None or seen:
-        of.weigh()
+    of.weigh()
 
 
 def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | None = None) -> Array:
