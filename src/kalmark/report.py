@@ -133,7 +133,10 @@ ELSEWHERE = "elsewhere"  # the kind of a gap in which a robot was carried
 
 
 class Gap(NamedTuple):
-    """A time without controls of a robot, so far: `kind` is "increments" (lost) or "held" (a velocity for too long).
+    """A time in which the motion of a robot is unknown, so far.
+
+    `kind` is "increments" (controls were lost), "held" (a velocity for too long), "ruled_out" (beyond its limits) or
+    "elsewhere": its pose was wrong, and is changed by `sigma_m` and `sigma_rad`.
 
     The standard deviations are those of each coordinate and each angle that the pose was given for it.
 

@@ -46,7 +46,6 @@ def _first(verdict: Mapping[str, Any]) -> str:
     why = ": the log does not check it" if verdict["map"] == UNCHECKED else harmful * (verdict["map"] != OK)
     what = "path" if str(verdict["checked"]).endswith((NO_MAP, NO_LANDMARKS)) else "map"
     because = harmful * (verdict["map"] == OK)
-    because = harmful * (verdict["map"] == OK)
     paths = [f"the path of {of} is {status}{because * (status != UNCHECKED)}" for of, status in _worse(verdict)]
     return "; but ".join([f"the {what} is {verdict['map']}{why}{_trust(verdict)}", *[", ".join(paths)] * bool(paths)])
 

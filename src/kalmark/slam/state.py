@@ -57,9 +57,8 @@ class State:
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
     `standing` are, of robots with detection of rest, the names of the sensors that do; `alternatives` are, of robots
     whose readings do not fit, the other explanations of these; `sums` are, of robots that may be in several places,
-    their poses; `evidence` is that robots are elsewhere;
-    `taken` are the events of this very time: the kind, the robot and the sensor of each; `given` is what
-    each sensor gave last; `balance` decides whether a dense map is compressed.
+    their poses; `evidence` is that robots are elsewhere; `taken` are the events of this very time: the kind, the robot
+    and the sensor of each; `given` is what each sensor gave last; `balance` decides whether a dense map is compressed.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
