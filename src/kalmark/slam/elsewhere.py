@@ -51,14 +51,13 @@ def correct(
 ) -> Correction:
     """Correct the map; observations with ids that are far off are used if others fit and their gate lets them.
 
-    A filter that is too sure may be off by `WIDER` times its sigmas: without a gate only what is farther is far off.
-    Where the gate is switched off all are used.
+    A filter that is too sure may be off by `WIDER` times its sigmas: only what is farther is far off.  Where the gate is
+    switched off all are used.
     """
     is_off = state.policies[scan.key].association.threshold(1, 0.0) == math.inf
     if scan.event.ids is None or is_off or not concerns(scan):
         return state.corrected(update, scan.event, estimator)
-    least = gate(SURVEYED, scan.channel.dof)
-    limit = min(WIDER**2 * least, max(update.gate, least))
+    limit = WIDER**2 * gate(SURVEYED, scan.channel.dof)
     done = state.corrected(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
     far = np.flatnonzero(~done.fused & (done.d2 > limit)).tolist()
     if not far:
