@@ -8,21 +8,25 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames import from_frame
+from kalmark.geometry.frames3d import minus
+from kalmark.geometry.rotations import from_matrix
 
 SAME_M, SAME_RAD = 0.5, 0.1  # two matchings so near to each other are of one pose
 
 
 def align_points(v: Array, l: Array, weights: Array) -> Array:
-    """Return the pose T (3,) with the least weighted squares of l - T v; v and l are (K, 2)."""
+    """Return the pose T, (3,) or (7,), with the least weighted squares of l - T v; v and l are (K, 2) or (K, 3)."""
     w = weights / weights.sum()
     a, b = w @ v, w @ l
-    p, q = v - a, l - b
-    theta = math.atan2(float(w @ (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])), float(w @ np.sum(p * q, axis=1)))
-    x, y = b - from_frame(np.array([0.0, 0.0, theta]), a)[0]
-    return np.array([x, y, theta])
+    U, _, Vt = np.linalg.svd((v - a).T * w @ (l - b))
+    proper = np.append(np.ones(len(a) - 1), np.sign(np.linalg.det(U @ Vt)))
+    Q = Vt.T * proper @ U.T
+    turn = [math.atan2(Q[1, 0], Q[0, 0])] if len(a) == 2 else from_matrix(Q)
+    return np.concatenate([b - Q @ a, turn])
 
 
 def is_same_pose(one: Array, other: Array) -> bool:
-    """Return whether two poses (3,) are so near to each other that they are one."""
-    return math.dist(one[:2], other[:2]) <= SAME_M and abs(wrap(one[2] - other[2])) <= SAME_RAD
+    """Return whether two poses, (3,) or (7,), are so near to each other that they are one."""
+    turn = wrap(one[2] - other[2]) if len(one) == 3 else np.linalg.norm(minus(one, other)[3:])
+    d = 2 if len(one) == 3 else 3
+    return math.dist(one[:d], other[:d]) <= SAME_M and abs(float(turn)) <= SAME_RAD

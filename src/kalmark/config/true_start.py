@@ -9,7 +9,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.events import Control
-from kalmark.geometry import frames, frames3d
+from kalmark.geometry.worlds import FRAMES
 from kalmark.logs.log import Log, begins_at
 from kalmark.models.protocols import Motion, coasts
 
@@ -31,7 +31,7 @@ def true_start(log: Log, name: str, motion: Motion) -> tuple[Array | None, Array
     size = len(pose)
     if coasts(motion) or motion.space.size != size or not len(later):
         return None, None
-    in_plane: Any = frames if size == 3 else frames3d
+    in_plane: Any = FRAMES[size]
     D, P = np.append(np.zeros(size - 1), float(size == 7)), np.zeros((motion.space.dof,) * 2)
     here, end_ns = D.copy(), int(later[0]) if motion.held else begin
     for u, N, dt_s, t_ns in pieces(log, name, motion, begin, int(later[0])):

@@ -17,8 +17,8 @@ from kalmark.batch.motion_chain import Chain
 from kalmark.errors import RunError
 from kalmark.events import Control, Fix, Raw, Scan
 from kalmark.files import write
-from kalmark.geometry import frames, frames3d
 from kalmark.geometry.rotations import matrix
+from kalmark.geometry.worlds import FRAMES
 from kalmark.logs.increments import cut_increments
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def _observed(event: Scan | Raw, robot: Robot, history: Any, rows: list[int]) ->
         y = history.y[row, :m]
         R = mount.sensor.noise(y[None])[0] if own is None else own if own.ndim == 2 else own[int(history.index[row])]
         p, J = _position(y) if tuple(mount.sensor.columns) in POLAR else (y, np.eye(m))
-        p, _, P_p = (frames if len(at) == 3 else frames3d).from_frame(at, p)
+        p, _, P_p = FRAMES[len(at)].from_frame(at, p)
         J = P_p @ J
         yield str(history.landmark[row]), p, J @ R @ J.T
 

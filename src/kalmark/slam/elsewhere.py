@@ -11,18 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.association.global_start import FEWEST_NAMED, GlobalPose, by_chance, search
+from kalmark.association.global_start import GlobalPose, by_chance, search
 from kalmark.association.relocalization import align_points, is_same_pose
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
+from kalmark.geometry import frames3d
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames import compose, from_frame, inverse, to_frame
 from kalmark.geometry.gaussian import gate
+from kalmark.geometry.spaces import Space
+from kalmark.geometry.worlds import FRAMES
 from kalmark.management import existence
 from kalmark.report import ELSEWHERE, Gap
 from kalmark.slam.alternative import Alternative, write_robot
@@ -35,15 +37,18 @@ from kalmark.tracks.surveys import SURVEYED
 ODDS = 1e6  # by which a robot is elsewhere, and is where it is placed
 WIDER = 3.0  # times its sigmas by which a filter that is too sure may be off
 LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
+FEWEST = {"point": 2, "point3": 3, "tag": 1}  # landmarks with ids that determine a pose
+SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
 HELD = 2  # scans of several landmarks that are held back without an alternative
 MOST = 48  # landmarks of a constellation
 MEANWHILE = "mapped while its robot was elsewhere"
 
 
 def concerns(scan: ScanContext) -> bool:
-    """Return whether a scan determines where its robot is: it finds the places of points in the plane."""
+    """Return whether a scan determines where its robot is: it finds places of points, in space by ids, or tags."""
     channel = scan.channel
-    return channel.gives_places and scan.dimensions == 2 and not channel.joins and channel.landmark.kind == "point"
+    is_known = scan.dimensions == 2 or (scan.event.ids is not None and None not in scan.event.ids)
+    return channel.gives_places and not channel.joins and channel.landmark.kind in FEWEST and is_known
 
 
 def correct(
@@ -51,15 +56,19 @@ def correct(
 ) -> Correction:
     """Correct the map; observations with ids that are far off are used if others fit and their gate lets them.
 
-    A filter that is too sure may be off by `WIDER` times its sigmas: only what is farther is far off.  Where the gate is
-    switched off all are used.
+    A filter that is too sure may be off by `WIDER` times its sigmas: only what is farther is far off, and what would be
+    behind a camera.  Where the gate is switched off all are used.
     """
     is_off = state.policies[scan.key].association.threshold(1, 0.0) == math.inf
     if scan.event.ids is None or is_off or not concerns(scan):
         return state.corrected(update, scan.event, estimator)
     limit = WIDER**2 * gate(SURVEYED, scan.channel.dof)
     done = state.corrected(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
-    far = np.flatnonzero(~done.fused & (done.d2 > limit)).tolist()
+    far = np.flatnonzero(~done.fused & ~(done.d2 <= limit)).tolist()
+    if far:
+        y = np.ascontiguousarray(update.y[far, : scan.y.shape[1]])
+        places = cast("Array", scan.channel.places(scan.map, scan.robot, y))
+        far = [k for k, p in zip(far, places, strict=True) if done.d2[k] > limit or np.isfinite(p).all()]
     if not far:
         return done
     of = state.evidence.setdefault(scan.event.robot, Evidence())
@@ -68,7 +77,7 @@ def correct(
     of.see((names[k] for k in fits), [SURE] * len(fits), scan.event.t_ns)
     of.weigh()
     out = [k for k in far if done.d2[k] <= update.gate]
-    of.held += len(of.missed) >= FEWEST_NAMED and not of.fitted
+    of.held += len(of.missed) >= SEVERAL and not of.fitted
     if (of.ratio < 0.0 and of.held <= HELD) or not out:
         return done
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
@@ -90,7 +99,7 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
         of.ratio, of.since_ns = -math.inf, state.moving[robot].held.adrift_since_ns
     if of.ratio >= 0.0 and all_named:
         del state.evidence[robot]
-    if of.ratio > -math.log(ODDS):
+    if of.ratio > -SURE:
         if of.fitted:
             state.alternatives.pop(robot, None)
             of.fitted = set()
@@ -116,10 +125,12 @@ def _note(scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
 
 def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | None = None) -> Array:
     """Return the log probability (M,) that observations have a landmark of a density in their gates by chance."""
+    named = np.array([scan.ids[k] is not None for k in rows], dtype=np.bool_)
+    if named.all():
+        return np.full(len(rows), -SURE)
     V = scan.channel.calibrated(scan.map).invert(scan.y[rows])[1][:, :2]
     C = V @ (scan.report.Z[rows] if Z is None else Z) @ V.swapaxes(1, 2)
     area = math.pi * gate(SURVEYED, 2) * np.sqrt(np.maximum(np.linalg.det(C), 0.0))
-    named = np.array([scan.ids[k] is not None for k in rows], dtype=np.bool_)
     chance = np.where(named, math.exp(-SURE), np.minimum(density * area, 1.0))
     return np.log(np.maximum(np.where(np.isfinite(chance), chance, 1.0), math.exp(-SURE)))
 
@@ -129,41 +140,43 @@ def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
     tracks, kind, young = state.tracks, scan.channel.landmark.kind, of.young
     known, old = tracks.known.of_kind.get(kind), Known(scan.channel.landmark)
     for name in known.names if known is not None else ():
-        old.add(name, _mean(state, name))
+        old.add(name, _block(state, name)[1])
     for name, track in tracks.confirmed.items():
         if track.model.kind == kind and name not in young:
-            old.add(name, _mean(state, name))
+            old.add(name, _block(state, name)[1])
     return old
 
 
 def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[Id | None], Array, Array]:
-    """Return the ids, places (K, 2) in the frame of the sensor and sigmas (K,) of what is seen, and was since."""
+    """Return the ids, places (K, 2 or 3) in the frame of the sensor and sigmas (K,) of what is seen, and was since."""
+    d, of_world = scan.dimensions, FRAMES[len(scan.channel.at)]
     v, V = scan.channel.calibrated(scan.map).invert(scan.y)
-    sigma = np.sqrt(np.trace(V[:, :2] @ scan.R @ V[:, :2].swapaxes(1, 2), axis1=1, axis2=2) / 2)
+    v, V = v[:, :d], V[:, :d]
+    sigma = np.sqrt(np.trace(V @ scan.R @ V.swapaxes(1, 2), axis1=1, axis2=2) / d)
     T, ids, tracks = scan.pose(), list(scan.ids), state.tracks
     shown = {o.landmark for o in scan.report.observations}
     for k, name in enumerate(ids):
-        if name is not None:
-            x, y = from_frame(T, v[k : k + 1, :2])[0][0]
-            of.far[name] = float(x), float(y), float(sigma[k])
-    more: list[tuple[Id | None, tuple[float, float], float]] = [
-        (name, (x, y), s) for name, (x, y, s) in of.far.items() if name not in ids
+        if name is not None and math.isfinite(sigma[k]):
+            of.far[name] = *of_world.from_frame(T, v[k])[0].tolist(), float(sigma[k])
+    more: list[tuple[Id | None, tuple[float, ...]]] = [
+        (name, place) for name, place in of.far.items() if name not in ids
     ]
     more += [
-        (None, tuple(state.map.mean(tracks.slots[name])[:2].tolist()), float(np.median(sigma)))
+        (None, (*state.map.mean(tracks.slots[name])[:d].tolist(), float(np.median(sigma))))
         for name in of.young
         if name in tracks.confirmed and name not in shown and tracks.is_invented(name)
     ]
     if more:
-        places = to_frame(T, np.array([p for _, p, _ in more]))[0]
-        ids, v = [*ids, *(name for name, _, _ in more)], np.concatenate([v[:, :2], places])
-        sigma = np.append(sigma, [s for _, _, s in more])
-    nearest = np.argsort(np.linalg.norm(v[:, :2], axis=1), kind="stable")[:MOST]
-    return [ids[k] for k in nearest.tolist()], v[nearest, :2], sigma[nearest]
+        rows = np.array([place for _, place in more])
+        ids, v = [*ids, *(name for name, _ in more)], np.concatenate([v, of_world.to_frame(T, rows[:, :d])[0]])
+        sigma = np.append(sigma, rows[:, d])
+    r = np.linalg.norm(v, axis=1)
+    nearest = [k for k in np.argsort(r, kind="stable").tolist() if math.isfinite(r[k])][:MOST]
+    return [ids[k] for k in nearest], v[nearest], sigma[nearest]
 
 
 class _Found(NamedTuple):
-    """A pose T (3,) of the sensor with its covariance (3, 3), the log odds against chance, and the rows it is by."""
+    """A pose T of the sensor, (3,) or (7,), with its covariance, the log odds against chance, and the rows it is by."""
 
     T: Array
     cov: Array
@@ -173,23 +186,50 @@ class _Found(NamedTuple):
 
 def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> _Found | None:
     """Return where a constellation is one of old landmarks, if there is one such place."""
+    if scan.channel.landmark.kind == "tag":
+        return _locate_by_tags(scan, old)
     ids, v, sigma = _constellation(state, scan, of)
-    at = {name: row for row, name in enumerate(old.names)}
+    at, d = {name: row for row, name in enumerate(old.names)}, scan.dimensions
     named = [k for k, name in enumerate(ids) if name in at]
     unnamed = np.array([k for k, name in enumerate(ids) if name is None], dtype=np.int64)
-    if len(named) >= FEWEST_NAMED:
+    fewest = FEWEST[scan.channel.landmark.kind]
+    if len(named) >= fewest:
         rows, some = [at[ids[k]] for k in named], np.array(named)  # type: ignore[index]
-        T, gain = align_points(v[some], old.places()[rows], sigma[some] ** -2), SURE * (len(some) - FEWEST_NAMED)
-        off = (from_frame(T, v[some])[0] - old.places()[rows]) / (LOOSE * sigma[some, None])
-        if np.sum(off**2) > gate(SURVEYED, 2 * len(some) - 3):
+        T, gain = align_points(v[some], old.places()[rows], sigma[some] ** -2), SURE * (len(some) - fewest)
+        off = (FRAMES[len(T)].from_frame(T, v[some])[0] - old.places()[rows]) / (LOOSE * sigma[some, None])
+        if np.sum(off**2) > gate(SURVEYED, d * len(some) - scan.channel.pose_dof):
             return None
-    else:
+    elif d == 2:
         found = search(old, v[unnamed], sigma[unnamed])
         if not isinstance(found, GlobalPose):
             return None
         T, some, rows = found.T, unnamed[found.matched >= 0], found.matched[found.matched >= 0].tolist()
         gain = -math.log(max(by_chance(old, v[unnamed], sigma[unnamed], found.pairs, len(old.names) ** 2), 1.0 / ODDS))
+    else:
+        return None
     return _Found(T, _pose_cov(T, v[some], sigma[some]), gain, rows)
+
+
+def _locate_by_tags(scan: ScanContext, old: Known) -> _Found | None:
+    """Return the pose by one of the tags, from which most of the others are where they stand."""
+    at = {name: row for row, name in enumerate(old.names)}
+    v, V = scan.channel.calibrated(scan.map).invert(scan.y)
+    seen = [k for k, name in enumerate(scan.ids) if name in at and np.isfinite(v[k]).all()]
+    rows, cov = [at[scan.ids[k]] for k in seen], V @ scan.R @ V.swapaxes(1, 2)  # type: ignore[index]
+    best: _Found | None = None
+    for k, row in zip(seen, rows, strict=True):
+        to_sensor, by_v = frames3d.inverse(v[k])
+        T, _, by_sensor = frames3d.compose(old.values[row], to_sensor)
+        J = LOOSE * by_sensor @ by_v
+        P = J @ cov[k] @ J.T
+        p, by_T, by_p = frames3d.from_frame(T, v[seen, :3])
+        S = by_T @ P @ by_T.swapaxes(1, 2) + LOOSE**2 * by_p @ cov[seen, :3, :3] @ by_p.swapaxes(1, 2)
+        off = p - old.places()[rows]
+        near = np.einsum("ki,ki->k", off, np.linalg.solve(S, off[..., None])[..., 0]) <= gate(SURVEYED, 3)
+        fits = [other for other, is_near in zip(rows, near.tolist(), strict=True) if is_near or other == row]
+        if best is None or (len(fits), -np.linalg.det(P)) > (len(best.rows), -np.linalg.det(best.cov)):
+            best = _Found(T, P, SURE * (len(fits) - FEWEST["tag"]), fits)
+    return best
 
 
 def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
@@ -198,14 +238,15 @@ def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     if found is None:
         return
     other = state.alternatives[name] = Alternative.of(state.map, state.moving[name], state.blocks, scan.event.t_ns)
-    pose = compose(found.T, compose(inverse(scan.pose())[0], r[:3])[0])[0]
-    write_robot(other.map, scan.robot, pose, found.cov)
+    of_world = FRAMES[len(scan.channel.at)]
+    to_robot = of_world.compose(of_world.inverse(scan.pose())[0], r[: len(found.T)])[0]
+    write_robot(other.map, scan.robot, of_world.compose(found.T, to_robot)[0], found.cov)
     of.gain, of.fitted = found.gain, {old.names[row] for row in found.rows}
 
 
 def _pose_cov(T: Array, v: Array, sigma: Array) -> Array:
-    """Return the covariance (3, 3) of a pose by the places v (K, 2) of landmarks with these sigmas (K,)."""
-    J = from_frame(T, v)[1]
+    """Return the covariance of a pose, (3, 3) or (6, 6), by the places v (K, 2 or 3) of landmarks with sigmas (K,)."""
+    J = FRAMES[len(T)].from_frame(T, v)[1]
     W = (LOOSE * sigma) ** -2.0
     cov: Array = np.linalg.inv(np.einsum("kai,k,kaj->ij", J, W, J))
     return cov
@@ -216,7 +257,7 @@ def _pair(scan: ScanContext, places: Array, old: Known) -> dict[int, int]:
 
     With an id it is the landmark of that name, without one the nearest.
     """
-    gaps, nearest = old.tree().query(places)
+    gaps, nearest = old.tree().query(np.nan_to_num(places))
     at = {name: row for row, name in enumerate(old.names)}
     pairs = [(at.get(name) if name is not None else int(nearest[k]), k) for k, name in enumerate(scan.ids)]
     return {row: k for row, k in sorted(pairs, key=lambda pair: -gaps[pair[1]]) if row is not None}
@@ -244,9 +285,9 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         logs = dict.fromkeys(existence.expected(view, old), looks.log_miss()) | logs
     of.gain += sum(log for name, log in logs.items() if name not in of.fitted)
     of.fitted |= logs.keys()
-    if of.gain >= math.log(ODDS) and fits:
-        again = _locate(state, scan, of, old)
-        if again is not None and is_same_pose(again.T, channel.pose(other.map, scan.robot)):
+    if of.gain - of.ratio >= 2.0 * math.log(ODDS) and fits:
+        again = _locate(state, scan, of, old) if None in scan.ids else None
+        if None not in scan.ids or (again and is_same_pose(again.T, channel.pose(other.map, scan.robot))):
             _place(state, scan, of, other, [*fits])
     elif of.gain <= -SURE:
         del state.alternatives[robot]
@@ -261,16 +302,19 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: Alternative, fi
     """
     robot, slot, tracks = scan.event.robot, scan.robot, state.tracks
     before, after, cov = state.map.mean(slot), other.map.mean(slot), other.map.covariance([slot])
-    places = np.array([_mean(state, name)[:2] for name in fits]) - after[:2]
-    A = np.zeros((len(fits), 2, 3))
-    A[:, :, :2], A[:, 0, 2], A[:, 1, 2] = np.eye(2), -places[:, 1], places[:, 0]
-    G = np.linalg.pinv(A.reshape(-1, 3)).reshape(3, -1, 2)
-    mapped = [k for k, name in enumerate(fits) if name not in tracks.known]
-    parts = ((slot, len(cov)), *((tracks.slots[fits[k]], 2) for k in mapped))
+    d, dof = scan.dimensions, scan.channel.pose_dof
+    A, mapped = list[Array](), [name for name in fits if name not in tracks.known]
+    for name in fits:
+        space, l = _block(state, name)
+        l[:d] -= after[:d]
+        A.append(np.hstack([np.eye(space.dof, d), space.generator(l)]))
+    ends = np.cumsum([0, *(len(part) for part in A)])
+    G = np.split(np.linalg.pinv(np.concatenate(A)), ends[1:-1], axis=1)
+    parts = ((slot, len(cov)), *((tracks.slots[name], len(A[fits.index(name)])) for name in mapped))
     rows, own = state.rows(parts), slice(0, len(cov))
     F, Q = np.eye(len(rows)), np.zeros((len(rows), len(rows)))
     F[own], Q[own, own] = 0.0, cov
-    F[:3, len(cov) :] = G[:, mapped].reshape(3, -1)
+    F[:dof, len(cov) :] = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] for name in mapped)])
     state.map.predict(rows, F, Q)
     state.map.set_predicted(slot, after)
     for name in [name for name in of.young if name in tracks.confirmed]:
@@ -284,11 +328,18 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: Alternative, fi
     for others in (state.alternatives, state.sums, state.evidence):
         others.pop(robot, None)
     if not scan.adrift:  # else the gap since which it is has been reported
-        turned, moved = abs(float(wrap(after[2] - before[2]))), math.dist(after[:2], before[:2])
+        turned = (
+            abs(float(wrap(after[2] - before[2])))
+            if d == 2
+            else float(np.linalg.norm(frames3d.minus(after[:7], before[:7])[3:]))
+        )
+        moved = math.dist(after[:d], before[:d])
         scan.report.gaps += (Gap(robot, ELSEWHERE, of.since_ns, scan.event.t_ns, moved, turned),)
 
 
-def _mean(state: State, name: Id) -> Array:
-    """Return the numbers of a landmark, in the map or known exactly."""
-    known = state.tracks.known
-    return known.mean(name) if name in known else state.map.mean(state.tracks.slots[name])
+def _block(state: State, name: Id) -> tuple[Space, Array]:
+    """Return the space and the numbers of a landmark, in the map or known exactly."""
+    known, confirmed = state.tracks.known, state.tracks.confirmed
+    if name in known:
+        return known.model(name).space, known.mean(name)
+    return confirmed[name].model.space, state.map.mean(confirmed[name].slot)

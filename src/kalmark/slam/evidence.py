@@ -31,8 +31,8 @@ class Evidence:
 
     Of these it is when they were seen last, since when they are missed, and the log.  `ratio` is the least one, of an
     onset at `since_ns`, `gain` that of the robot's alternative, in which the landmarks `fitted` have counted.  `far`
-    are the places (x, y, sigma) of observations with ids elsewhere, as the filter has them, and so many scans of these
-    were `held` back.
+    are the places (x, y, sigma), in space with z, of observations with ids elsewhere, as the filter has them, and so
+    many scans of these were `held` back.
     """
 
     seen: dict[Id, tuple[int, int, float]] = field(default_factory=dict)
@@ -40,7 +40,7 @@ class Evidence:
     ratio: float = 0.0
     since_ns: int = 0
     held: int = 0
-    far: dict[Id, tuple[float, float, float]] = field(default_factory=dict)
+    far: dict[Id, tuple[float, ...]] = field(default_factory=dict)
     gain: float = 0.0
     fitted: set[Id] = field(default_factory=set)
 

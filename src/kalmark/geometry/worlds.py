@@ -1,0 +1,9 @@
+"""The frames of the plane and of space, by how many numbers a pose has."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from kalmark.geometry import frames, frames3d
+
+FRAMES: dict[int, Any] = {3: frames, 7: frames3d}
