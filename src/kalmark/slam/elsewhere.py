@@ -1,9 +1,10 @@
 """A robot that is elsewhere than its filter has it: found by evidence, placed where the log fits better.
 
-A covariance does not show that a robot was carried away.  The log does (`evidence.py`).  At - log `ODDS` a pose is
-looked for at which the scan, and what was mapped since the onset, is that of old landmarks
-(`association/global_start.py`).  A second filter of the robot alone begins there, an `Alternative`, on the old map as
-it is, with the same ratio.  Where that reaches log `ODDS` the robot is placed there; what was mapped meanwhile goes.
+A covariance does not show that a robot was carried away.  The log does (`evidence.py`).  From - `SURE` on a pose is
+looked for at which the scan, and what was mapped since the onset, is that of old landmarks: by a tag, by points with
+ids, or by distances (`association/global_start.py`).  A second filter of the robot alone begins there, an
+`Alternative`, on the old map as it is, with the same ratio.  Where both differ by log `ODDS` the robot is placed there;
+what was mapped meanwhile goes.
 """
 
 from __future__ import annotations
@@ -34,12 +35,13 @@ from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.surveys import SURVEYED
 
-ODDS = 1e6  # by which a robot is elsewhere, and is where it is placed
+ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
 WIDER = 3.0  # times its sigmas by which a filter that is too sure may be off
 LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
 FEWEST = {"point": 2, "point3": 3, "tag": 1}  # landmarks with ids that determine a pose
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
 HELD = 2  # scans of several landmarks that are held back without an alternative
+MOST_BY_SHAPE = 2.0 * SURE  # log odds that a constellation without ids counts
 MOST = 48  # landmarks of a constellation
 MEANWHILE = "mapped while its robot was elsewhere"
 
@@ -78,7 +80,7 @@ def correct(
     of.weigh()
     out = [k for k in far if done.d2[k] <= update.gate]
     of.held += len(of.missed) >= SEVERAL and not of.fitted
-    if (of.ratio < 0.0 and of.held <= HELD) or not out:
+    if of.ratio >= 0.0 or of.held <= HELD or not out:
         return done
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
     fused = done.fused.copy()
@@ -103,10 +105,12 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
         if of.fitted:
             state.alternatives.pop(robot, None)
             of.fitted = set()
-    elif of.fitted and robot in state.alternatives:
-        _try(state, scan, of, _old(state, scan, of))
-    elif look is not None or scan.adrift or all_named:
-        _propose(state, scan, of, _old(state, scan, of))
+        return
+    old = _old(state, scan, of)
+    if (not of.fitted or robot not in state.alternatives) and (look is not None or scan.adrift or all_named):
+        _propose(state, scan, of, old)
+    if of.fitted and robot in state.alternatives:
+        _try(state, scan, of, old)
 
 
 def _note(scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
@@ -204,7 +208,8 @@ def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> _Found
         if not isinstance(found, GlobalPose):
             return None
         T, some, rows = found.T, unnamed[found.matched >= 0], found.matched[found.matched >= 0].tolist()
-        gain = -math.log(max(by_chance(old, v[unnamed], sigma[unnamed], found.pairs, len(old.names) ** 2), 1.0 / ODDS))
+        chance = by_chance(old, v[unnamed], sigma[unnamed], found.pairs, len(old.names) ** 2)
+        gain = -math.log(max(chance, math.exp(-MOST_BY_SHAPE)))
     else:
         return None
     return _Found(T, _pose_cov(T, v[some], sigma[some]), gain, rows)
@@ -285,7 +290,7 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         logs = dict.fromkeys(existence.expected(view, old), looks.log_miss()) | logs
     of.gain += sum(log for name, log in logs.items() if name not in of.fitted)
     of.fitted |= logs.keys()
-    if of.gain - of.ratio >= 2.0 * math.log(ODDS) and fits:
+    if of.gain - of.ratio >= math.log(ODDS) and fits:
         again = _locate(state, scan, of, old) if None in scan.ids else None
         if None not in scan.ids or (again and is_same_pose(again.T, channel.pose(other.map, scan.robot))):
             _place(state, scan, of, other, [*fits])
