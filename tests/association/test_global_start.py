@@ -11,16 +11,21 @@ from kalmark.association import global_start
 from kalmark.association.global_start import (
     REACH,
     GlobalPose,
+    Proposal,
     bases,
     by_chance,
     distinct,
     hypotheses,
+    locate_points,
+    locate_tags,
     points_at_poses,
     refine_pose,
     search,
 )
 from kalmark.association.relocalization import align_points, is_same_pose
+from kalmark.geometry import frames3d
 from kalmark.geometry.frames import to_frame
+from kalmark.geometry.worlds import FRAMES
 from kalmark.tracks.known_landmarks import Known
 
 PLACES = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [9.0, 1.0], [5.0, 8.0], [-6.0, 3.0]])
@@ -115,3 +120,40 @@ def test_a_scan_that_does_not_determine_a_pose_is_refused_with_the_reason() -> N
     assert search(known(PLACES), elsewhere, SIGMA[:3]) == "no pose in the known map explains its scan"
     strange = np.vstack([to_frame(T, PLACES[:3])[0], [[50.0, 50.0], [70.0, -40.0], [-60.0, 33.0]]])
     assert search(known(PLACES), strange, SIGMA) == "at most 3 of its 6 observations agree with a pose in the known map"
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_ids_determine_a_pose_by_those_that_agree(d: int) -> None:
+    """Two of twelve stand elsewhere."""
+    rng = np.random.default_rng(d)
+    l, frames = rng.uniform(-9, 9, (12, d)), FRAMES[3 if d == 2 else 7]
+    pose = T if d == 2 else np.array([1.0, -2.0, 0.5, 0.1, 0.5, -0.5, 0.7])
+    of = Known(km.landmarks.Point2D() if d == 2 else km.landmarks.Point3D())
+    for i, place in enumerate(l):
+        of.add(i, place + (3.0 if i < 2 else 0.0))
+    v = frames.to_frame(pose, l)[0] + rng.normal(0.0, 0.01, l.shape)
+    found = locate_points(of, [*range(12)], v, np.full(12, 0.01))
+    assert isinstance(found, Proposal)
+    assert found.matched.tolist() == [-1, -1, *range(2, 12)]
+    assert found.gain == 7.0 * (10 - d)
+    assert is_same_pose(found.T, pose)
+    np.testing.assert_allclose(found.T, pose, atol=0.02)
+    assert isinstance(locate_points(of, [*range(12)], 3.0 * v, np.full(12, 0.01)), str)
+    assert isinstance(locate_points(of, [0, *[None] * 11], v, np.full(12, 0.01)), Proposal if d == 2 else str)
+
+
+def test_the_tag_with_which_most_agree_determines_a_pose() -> None:
+    rng = np.random.default_rng(1)
+    of, seen, pose = Known(km.landmarks.Tag()), [], np.array([1.0, -2.0, 0.5, 0.0, 0.0, 0.6, 0.8])
+    for i in range(5):
+        l = np.append(rng.uniform(-3, 3, 3), rng.normal(size=4))
+        l[3:] /= np.linalg.norm(l[3:])
+        of.add(i, l + np.array([2.0 * (i == 0), 0, 0, 0, 0, 0, 0]))
+        seen.append(frames3d.compose(frames3d.inverse(pose)[0], l)[0])
+    cov = np.tile(1e-4 * np.eye(6), (6, 1, 1))
+    found = locate_tags(of, [*range(5), 9], np.array([*seen, np.full(7, np.nan)]), cov)
+    assert isinstance(found, Proposal)
+    assert found.matched.tolist() == [-1, 1, 2, 3, 4, -1]
+    assert found.gain == 21.0
+    np.testing.assert_allclose(found.T, pose, atol=1e-9)
+    assert isinstance(locate_tags(of, [9], np.array(seen[:1]), cov[:1]), str)

@@ -1,8 +1,10 @@
-"""The start of a robot in a known map by one scan, without a prior of its pose.  [T] exercise 1, [F].
+"""The pose of a sensor among known landmarks, without a prior of it.  [T] exercise 1, [F].
 
-Two observed places and two landmarks as far from each other determine a pose.  Each such pose is tested with all of the
-scan: how many places are at landmarks (RANSAC of Fischler and Bolles 1981, but every pair is tried).  The best one is
-taken if a matching as good is not expected by chance and none from elsewhere comes near it; else a later scan decides.
+*By ids*: as few landmarks as determine a pose are chosen by lot, the pose with which most others agree is taken; a tag
+determines one alone.  *By distances*: two observed places and two landmarks as far from each other determine a pose of
+the plane.  Each such pose is tested with all of the scan: how many places are at landmarks (RANSAC of Fischler and
+Bolles 1981, but every pair is tried).  The best one is taken if a matching as good is not expected by chance and none
+from elsewhere comes near it; else a later scan decides.
 """
 
 from __future__ import annotations
@@ -15,15 +17,18 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.association.protocol import NEW, Decision
-from kalmark.association.query import Query
 from kalmark.association.relocalization import align_points, is_same_pose
 from kalmark.events import Id
+from kalmark.geometry import frames3d
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.report import Observation
+from kalmark.geometry.worlds import FRAMES
 from kalmark.tracks.known_landmarks import Known
 
-FEWEST, FEWEST_NAMED = 3, 2  # pairs without and with ids
+FEWEST = 3  # pairs without ids
+FEWEST_NAMED = {2: 2, 3: 3}  # with ids, by the dimensions of the world
+LOTS = 32  # of so few pairs that are drawn
+LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
+SURE = 7.0  # the most that one landmark counts: log odds
 BASES = 8  # pairs of observations from which poses are computed
 SIGMAS = 3.0  # by which the distances of a pair may differ
 REACH = 0.999  # of right pairs pass the gate
@@ -33,20 +38,8 @@ MOST_PAIRS = 2_000_000  # of landmarks
 AT_ONCE = 20_000  # poses tested at once
 
 
-class Located(NamedTuple):
-    """The pose T (3,) of the sensor, and what each observation is of; or, without them, why it is not known yet.
-
-    `fates` (K,) are those of observations that have corrected what is known of the pose, and do not determine it.
-    """
-
-    T: Array | None
-    decisions: list[Decision] | None
-    why: str
-    fates: Sequence[Observation] = ()
-
-
 class GlobalPose(NamedTuple):
-    """A pose T (3,) and the landmark of each observation (K,), -1 for none."""
+    """A pose T (3,) or (7,) and the row of the landmark of each observation (K,), -1 for none."""
 
     T: Array
     matched: Index
@@ -57,28 +50,89 @@ class GlobalPose(NamedTuple):
         return int((self.matched >= 0).sum())
 
 
-def locate_sensor(query: Query) -> Located:
-    """Return where the sensor of a scan is in the known map, if the scan determines it."""
-    scan, channel = query.scan, query.scan.channel
-    of = next((known for kind, known in scan.tracks.known.of_kind.items() if kind in channel.models), None)
-    if of is None or not channel.gives_places or scan.dimensions != 2:
-        return Located(None, None, "its sensor does not find the places of known landmarks")
-    v, V_y = (a[:, :2] for a in channel.calibrated(scan.map).invert(scan.y))
-    sigma = np.sqrt(np.trace(V_y @ scan.R @ V_y.swapaxes(1, 2), axis1=1, axis2=2) / 2)
-    named = [k for k, i in enumerate(query.ids) if i is not None and i in scan.tracks.known]
-    if len(named) >= FEWEST_NAMED:
-        l = np.array([scan.tracks.known.mean(i)[:2] for i in (query.ids[k] for k in named) if i is not None])
-        return Located(align_points(v[named], l, sigma[named] ** -2), None, "")
-    unnamed = np.array([k for k, i in enumerate(query.ids) if i is None], dtype=np.int64)
-    found = search(of, v[unnamed], sigma[unnamed])
-    if isinstance(found, str):
-        return Located(None, None, found)
-    why = f"found in the known map: {found.pairs} of {len(unnamed)} observations agree"
-    decisions: list[Decision] = [(i, "") if i is not None else (NEW, "") for i in query.ids]
-    for k, row in zip(unnamed.tolist(), found.matched.tolist(), strict=True):
-        name: Id | None = of.names[row] if row >= 0 else None
-        decisions[k] = (name, why if name is not None else "not of the known map from where the others are")
-    return Located(found.T, decisions, why)
+class Proposal(NamedTuple):
+    """A pose T of a sensor, (3,) or (7,), its covariance, the landmark of each observation (K,) and the log odds.
+
+    These are against chance; a landmark counts at most `SURE`, what has no ids twice that.
+    """
+
+    T: Array
+    cov: Array
+    matched: Index
+    gain: float
+
+
+def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:
+    """Return the pose that points v (K, d) with these ids and sigmas (K,) determine, or why they do not."""
+    rows = rows_of(of, ids)
+    if (rows >= 0).sum() >= FEWEST_NAMED[v.shape[1]]:
+        pose = _most_agreeing(of, v, sigma, rows)
+        gain = 0.0 if isinstance(pose, str) else SURE * (pose.pairs - FEWEST_NAMED[v.shape[1]])
+    elif v.shape[1] == 3:
+        return f"its scan has {(rows >= 0).sum()} landmarks with ids, a pose in space needs {FEWEST_NAMED[3]}"
+    else:
+        unnamed = np.array([k for k, i in enumerate(ids) if i is None], dtype=np.int64)
+        found = search(of, v[unnamed], sigma[unnamed])
+        pose, gain = found, 0.0
+        if not isinstance(found, str):
+            pose = GlobalPose(found.T, np.full(len(v), -1))
+            pose.matched[unnamed] = found.matched
+            chance = by_chance(of, v[unnamed], sigma[unnamed], found.pairs, len(of.names) ** 2)
+            gain = -math.log(max(chance, math.exp(-2.0 * SURE)))
+    if isinstance(pose, str):
+        return pose
+    some = pose.matched >= 0
+    J = FRAMES[len(pose.T)].from_frame(pose.T, v[some])[1]
+    W = (LOOSE * sigma[some]) ** -2.0
+    return Proposal(pose.T, np.linalg.inv(np.einsum("kai,k,kaj->ij", J, W, J)), pose.matched, gain)
+
+
+def rows_of(of: Known, ids: Sequence[Id | None]) -> Index:
+    """Return the rows (K,) of landmarks with these ids, -1 where there is none."""
+    at = {name: row for row, name in enumerate(of.names)}
+    return np.array([-1 if name is None else at.get(name, -1) for name in ids], dtype=np.int64)
+
+
+def _most_agreeing(of: Known, v: Array, sigma: Array, rows: Index) -> GlobalPose | str:
+    """Return the pose with which most points v (K, d) of landmarks `rows` (K,) agree, and the landmarks of these."""
+    some, d, rng = np.flatnonzero(rows >= 0), v.shape[1], np.random.default_rng(0)
+    l, fewest, best, pose = of.places()[rows], FEWEST_NAMED[d], np.zeros(0, dtype=np.int64), np.zeros(3)
+    for lot in range(LOTS):
+        chosen = some if lot == 0 else rng.choice(some, fewest, replace=False)
+        for _ in range(2):  # the second time by all that agree
+            T = align_points(v[chosen], l[chosen], sigma[chosen] ** -2)
+            off = FRAMES[len(T)].from_frame(T, v[some])[0] - l[some]
+            near = np.sum(off**2, axis=1) <= chi2_gate(REACH, d) * (LOOSE * sigma[some]) ** 2
+            chosen = some[near] if near.sum() >= fewest else chosen
+        if len(best) < near.sum():
+            best, pose = some[near], T
+        if len(best) == len(some):
+            break
+    if len(best) < fewest:
+        return f"its {len(some)} landmarks with ids do not agree on a pose"
+    matched = np.full(len(rows), -1)
+    matched[best] = rows[best]
+    return GlobalPose(pose, matched)
+
+
+def locate_tags(of: Known, ids: Sequence[Id | None], v: Array, cov: Array) -> Proposal | str:
+    """Return the pose by the tag v (K, 7) with the covariance (K, 6, 6) with which most others agree, or why not."""
+    rows = rows_of(of, ids)
+    seen = np.flatnonzero((rows >= 0) & np.isfinite(v).all(axis=1))
+    l, best = of.places()[rows[seen]], Proposal(np.zeros(7), np.eye(6), np.full(len(rows), -1), -math.inf)
+    for k in seen.tolist():
+        to_sensor, by_v = frames3d.inverse(v[k])
+        T, _, by_sensor = frames3d.compose(of.values[rows[k]], to_sensor)
+        J = LOOSE * by_sensor @ by_v
+        P = J @ cov[k] @ J.T
+        p, by_T, by_p = frames3d.from_frame(T, v[seen, :3])
+        S = by_T @ P @ by_T.swapaxes(1, 2) + LOOSE**2 * by_p @ cov[seen, :3, :3] @ by_p.swapaxes(1, 2)
+        near = np.sum((p - l) * np.linalg.solve(S, (p - l)[..., None])[..., 0], axis=1) <= chi2_gate(REACH, 3)
+        if SURE * (near.sum() - 1) > best.gain:
+            matched = np.full(len(rows), -1)
+            matched[seen[near]] = rows[seen[near]]
+            best = Proposal(T, P, matched, SURE * (near.sum() - 1))
+    return best if len(seen) else "it sees no tag with the id of one that is known, and of one pose"
 
 
 def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:

@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.association.global_start import GlobalPose, by_chance, search
-from kalmark.association.relocalization import align_points, is_same_pose
+from kalmark.association.global_start import LOOSE, SURE, Proposal, locate_points, locate_tags
+from kalmark.association.relocalization import is_same_pose
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry import frames3d
@@ -29,7 +29,7 @@ from kalmark.geometry.worlds import FRAMES
 from kalmark.management import existence
 from kalmark.report import ELSEWHERE, Gap
 from kalmark.slam.alternative import Alternative, write_robot
-from kalmark.slam.evidence import SURE, Evidence
+from kalmark.slam.evidence import Evidence
 from kalmark.slam.state import State
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import ScanContext
@@ -37,11 +37,9 @@ from kalmark.tracks.surveys import SURVEYED
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
 WIDER = 3.0  # times its sigmas by which a filter that is too sure may be off
-LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
-FEWEST = {"point": 2, "point3": 3, "tag": 1}  # landmarks with ids that determine a pose
+KINDS = "point", "point3", "tag"
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
 HELD = 2  # scans of several landmarks that are held back without an alternative
-MOST_BY_SHAPE = 2.0 * SURE  # log odds that a constellation without ids counts
 MOST = 48  # landmarks of a constellation
 MEANWHILE = "mapped while its robot was elsewhere"
 
@@ -50,7 +48,7 @@ def concerns(scan: ScanContext) -> bool:
     """Return whether a scan determines where its robot is: it finds places of points, in space by ids, or tags."""
     channel = scan.channel
     is_known = scan.dimensions == 2 or (scan.event.ids is not None and None not in scan.event.ids)
-    return channel.gives_places and not channel.joins and channel.landmark.kind in FEWEST and is_known
+    return channel.gives_places and not channel.joins and channel.landmark.kind in KINDS and is_known
 
 
 def correct(
@@ -154,9 +152,7 @@ def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
 def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[Id | None], Array, Array]:
     """Return the ids, places (K, 2 or 3) in the frame of the sensor and sigmas (K,) of what is seen, and was since."""
     d, of_world = scan.dimensions, FRAMES[len(scan.channel.at)]
-    v, V = scan.channel.calibrated(scan.map).invert(scan.y)
-    v, V = v[:, :d], V[:, :d]
-    sigma = np.sqrt(np.trace(V @ scan.R @ V.swapaxes(1, 2), axis1=1, axis2=2) / d)
+    v, sigma = scan.places()
     T, ids, tracks = scan.pose(), list(scan.ids), state.tracks
     shown = {o.landmark for o in scan.report.observations}
     for k, name in enumerate(ids):
@@ -179,62 +175,14 @@ def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[
     return [ids[k] for k in nearest], v[nearest], sigma[nearest]
 
 
-class _Found(NamedTuple):
-    """A pose T of the sensor, (3,) or (7,), with its covariance, the log odds against chance, and the rows it is by."""
-
-    T: Array
-    cov: Array
-    gain: float
-    rows: list[int]
-
-
-def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> _Found | None:
+def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposal | None:
     """Return where a constellation is one of old landmarks, if there is one such place."""
     if scan.channel.landmark.kind == "tag":
-        return _locate_by_tags(scan, old)
-    ids, v, sigma = _constellation(state, scan, of)
-    at, d = {name: row for row, name in enumerate(old.names)}, scan.dimensions
-    named = [k for k, name in enumerate(ids) if name in at]
-    unnamed = np.array([k for k, name in enumerate(ids) if name is None], dtype=np.int64)
-    fewest = FEWEST[scan.channel.landmark.kind]
-    if len(named) >= fewest:
-        rows, some = [at[ids[k]] for k in named], np.array(named)  # type: ignore[index]
-        T, gain = align_points(v[some], old.places()[rows], sigma[some] ** -2), SURE * (len(some) - fewest)
-        off = (FRAMES[len(T)].from_frame(T, v[some])[0] - old.places()[rows]) / (LOOSE * sigma[some, None])
-        if np.sum(off**2) > gate(SURVEYED, d * len(some) - scan.channel.pose_dof):
-            return None
-    elif d == 2:
-        found = search(old, v[unnamed], sigma[unnamed])
-        if not isinstance(found, GlobalPose):
-            return None
-        T, some, rows = found.T, unnamed[found.matched >= 0], found.matched[found.matched >= 0].tolist()
-        chance = by_chance(old, v[unnamed], sigma[unnamed], found.pairs, len(old.names) ** 2)
-        gain = -math.log(max(chance, math.exp(-MOST_BY_SHAPE)))
+        v, V = scan.channel.calibrated(scan.map).invert(scan.y)
+        found = locate_tags(old, scan.ids, v, V @ scan.R @ V.swapaxes(1, 2))
     else:
-        return None
-    return _Found(T, _pose_cov(T, v[some], sigma[some]), gain, rows)
-
-
-def _locate_by_tags(scan: ScanContext, old: Known) -> _Found | None:
-    """Return the pose by one of the tags, from which most of the others are where they stand."""
-    at = {name: row for row, name in enumerate(old.names)}
-    v, V = scan.channel.calibrated(scan.map).invert(scan.y)
-    seen = [k for k, name in enumerate(scan.ids) if name in at and np.isfinite(v[k]).all()]
-    rows, cov = [at[scan.ids[k]] for k in seen], V @ scan.R @ V.swapaxes(1, 2)  # type: ignore[index]
-    best: _Found | None = None
-    for k, row in zip(seen, rows, strict=True):
-        to_sensor, by_v = frames3d.inverse(v[k])
-        T, _, by_sensor = frames3d.compose(old.values[row], to_sensor)
-        J = LOOSE * by_sensor @ by_v
-        P = J @ cov[k] @ J.T
-        p, by_T, by_p = frames3d.from_frame(T, v[seen, :3])
-        S = by_T @ P @ by_T.swapaxes(1, 2) + LOOSE**2 * by_p @ cov[seen, :3, :3] @ by_p.swapaxes(1, 2)
-        off = p - old.places()[rows]
-        near = np.einsum("ki,ki->k", off, np.linalg.solve(S, off[..., None])[..., 0]) <= gate(SURVEYED, 3)
-        fits = [other for other, is_near in zip(rows, near.tolist(), strict=True) if is_near or other == row]
-        if best is None or (len(fits), -np.linalg.det(P)) > (len(best.rows), -np.linalg.det(best.cov)):
-            best = _Found(T, P, SURE * (len(fits) - FEWEST["tag"]), fits)
-    return best
+        found = locate_points(old, *_constellation(state, scan, of))
+    return None if isinstance(found, str) else found
 
 
 def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
@@ -246,15 +194,7 @@ def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     of_world = FRAMES[len(scan.channel.at)]
     to_robot = of_world.compose(of_world.inverse(scan.pose())[0], r[: len(found.T)])[0]
     write_robot(other.map, scan.robot, of_world.compose(found.T, to_robot)[0], found.cov)
-    of.gain, of.fitted = found.gain, {old.names[row] for row in found.rows}
-
-
-def _pose_cov(T: Array, v: Array, sigma: Array) -> Array:
-    """Return the covariance of a pose, (3, 3) or (6, 6), by the places v (K, 2 or 3) of landmarks with sigmas (K,)."""
-    J = FRAMES[len(T)].from_frame(T, v)[1]
-    W = (LOOSE * sigma) ** -2.0
-    cov: Array = np.linalg.inv(np.einsum("kai,k,kaj->ij", J, W, J))
-    return cov
+    of.gain, of.fitted = found.gain, {old.names[row] for row in found.matched if row >= 0}
 
 
 def _pair(scan: ScanContext, places: Array, old: Known) -> dict[int, int]:

@@ -18,9 +18,9 @@ from itertools import islice
 
 import numpy as np
 
+from kalmark.association.global_start import SURE
 from kalmark.events import Id
 
-SURE = 7.0  # the most that one landmark counts: log odds
 MOST, RECENT = 64, 256  # landmarks that were missed last, and seen last, which outweigh all older ones
 NEVER_NS = -1
 

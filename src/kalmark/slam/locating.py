@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.association.global_start import FEWEST, Located, locate_sensor
+from kalmark.association.global_start import FEWEST, FEWEST_NAMED, locate_points, rows_of
+from kalmark.association.protocol import NEW, Decision
 from kalmark.association.query import Query
 from kalmark.events import Id
 from kalmark.filter.map import Map
@@ -44,6 +45,18 @@ ONE = "from an unknown place it takes two known landmarks, expected a second one
 DIRECTION = "it determines no distance from an unknown place, expected ranges too or a start with a smaller sigma_xy_m"
 
 
+class Located(NamedTuple):
+    """The pose T (3,) of the sensor, and what each observation is of; or, without them, why it is not known yet.
+
+    `fates` (K,) are those of observations that have corrected what is known of the pose, and do not determine it.
+    """
+
+    T: Array | None
+    decisions: list[Decision] | None
+    why: str
+    fates: Sequence[Observation] = ()
+
+
 def locate_in_known_map(state: State, scan: ScanContext, query: Query) -> Located | None:
     """Move a robot that may be anywhere in a known map to where its scan fits; None of a robot that may not.
 
@@ -57,7 +70,7 @@ def locate_in_known_map(state: State, scan: ScanContext, query: Query) -> Locate
     if scan.channel.gives_places:
         if len(state.tracks.known) < FEWEST or (not shown and turn_holds(P)):
             return None
-        found = locate_sensor(query)
+        found = _locate(query)
         if found.T is not None:
             _put(state, scan, found.T)
             state.sums.pop(name, None)
@@ -78,6 +91,26 @@ def locate_in_known_map(state: State, scan: ScanContext, query: Query) -> Locate
         moving = state.moving[name]
         sum_ = state.sums[name] = GaussianSum.of(state.map, moving, state.blocks, scan.event.t_ns, _gate(scan))
     return _summed(state, scan, sum_)
+
+
+def _locate(query: Query) -> Located:
+    """Return where the sensor of a scan is in the known map, if the scan determines it."""
+    scan, ids = query.scan, query.ids
+    of = next((known for kind, known in scan.tracks.known.of_kind.items() if kind in scan.channel.models), None)
+    if of is None:
+        return Located(None, None, "its sensor does not find the places of known landmarks")
+    found = locate_points(of, ids, *scan.places())
+    if isinstance(found, str):
+        return Located(None, None, found)
+    if (rows_of(of, ids) >= 0).sum() >= FEWEST_NAMED[2]:
+        return Located(found.T, None, "")
+    why = f"found in the known map: {(found.matched >= 0).sum()} of {ids.count(None)} observations agree"
+    missed: Decision = NEW, "not of the known map from where the others are"
+    decisions: list[Decision] = [
+        (i, "") if i is not None else (of.names[row], why) if row >= 0 else missed
+        for i, row in zip(ids, found.matched.tolist(), strict=True)
+    ]
+    return Located(found.T, decisions, "")
 
 
 def _nonlinear_axes(state: State, scan: ScanContext) -> Flags | None:

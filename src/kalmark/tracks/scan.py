@@ -85,6 +85,12 @@ class ScanContext:
         """Return the pose of the sensor as it is estimated now, (3,) or (7,)."""
         return self.channel.pose(self.map, self.robot)
 
+    def places(self) -> tuple[Array, Array]:
+        """Return where observations are from a sensor that gives places (K, 2 or 3), and their sigmas (K,)."""
+        d = self.dimensions
+        v, V = (a[:, :d] for a in self.channel.calibrated(self.map).invert(self.y))
+        return v, np.sqrt(np.trace(V @ self.R @ V.swapaxes(1, 2), axis1=1, axis2=2) / d)
+
     def size_of(self, k: int) -> float | None:
         """Return the size of the tag of the k-th observation, m, if its sensor measures one."""
         return float(self.y[k, -1]) if "size_m" in self.channel.sensor.columns else None
