@@ -25,7 +25,7 @@ from kalmark.association.global_start import (
 from kalmark.association.relocalization import align_points, is_same_pose
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import to_frame
-from kalmark.geometry.worlds import FRAMES
+from kalmark.geometry.pose_frames import FRAMES
 from kalmark.tracks.known_landmarks import Known
 
 PLACES = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [9.0, 1.0], [5.0, 8.0], [-6.0, 3.0]])

@@ -21,7 +21,7 @@ from kalmark.association.relocalization import align_points, is_same_pose
 from kalmark.events import Id
 from kalmark.geometry import frames3d
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.geometry.worlds import FRAMES
+from kalmark.geometry.pose_frames import FRAMES
 from kalmark.tracks.known_landmarks import Known
 
 FEWEST = 3  # pairs without ids

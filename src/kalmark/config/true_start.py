@@ -9,7 +9,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.events import Control
-from kalmark.geometry.worlds import FRAMES
+from kalmark.geometry.pose_frames import FRAMES
 from kalmark.logs.log import Log, begins_at
 from kalmark.models.protocols import Motion, coasts
 

@@ -17,8 +17,8 @@ from kalmark.batch.motion_chain import Chain
 from kalmark.errors import RunError
 from kalmark.events import Control, Fix, Raw, Scan
 from kalmark.files import write
+from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.rotations import matrix
-from kalmark.geometry.worlds import FRAMES
 from kalmark.logs.increments import cut_increments
 
 if TYPE_CHECKING:

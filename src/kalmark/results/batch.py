@@ -21,8 +21,8 @@ from kalmark.batch.solver import Batch, optimum
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
+from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
-from kalmark.geometry.worlds import FRAMES
 from kalmark.logs.progress import track
 from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
 from kalmark.models.protocols import Landmark, OfState, SeesVelocity

@@ -24,8 +24,8 @@ from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry import frames3d
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate
+from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import Space
-from kalmark.geometry.worlds import FRAMES
 from kalmark.management import existence
 from kalmark.report import ELSEWHERE, Gap
 from kalmark.slam.alternative import Alternative, write_robot
@@ -64,11 +64,7 @@ def correct(
         return state.corrected(update, scan.event, estimator)
     limit = WIDER**2 * gate(SURVEYED, scan.channel.dof)
     done = state.corrected(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
-    far = np.flatnonzero(~done.fused & ~(done.d2 <= limit)).tolist()
-    if far:
-        y = np.ascontiguousarray(update.y[far, : scan.y.shape[1]])
-        places = cast("Array", scan.channel.places(scan.map, scan.robot, y))
-        far = [k for k, p in zip(far, places, strict=True) if done.d2[k] > limit or np.isfinite(p).all()]
+    far = _far(scan, update, done, limit)
     if not far:
         return done
     of = state.evidence.setdefault(scan.event.robot, Evidence())
@@ -86,6 +82,16 @@ def correct(
     return done._replace(fused=fused)
 
 
+def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> list[int]:
+    """Return the observations beyond a limit, and those of things that cannot be seen from here."""
+    far = np.flatnonzero(~done.fused & ~(done.d2 <= limit)).tolist()
+    if not far:
+        return []
+    y = np.ascontiguousarray(update.y[far, : scan.y.shape[1]])
+    places = cast("Array", scan.channel.places(scan.map, scan.robot, y))
+    return [k for k, p in zip(far, places, strict=True) if done.d2[k] > limit or np.isfinite(p).all()]
+
+
 def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
     """Take note of the landmarks that a scan saw and missed, and place its robot where that is beyond doubt."""
     robot = scan.event.robot
@@ -99,16 +105,15 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
         of.ratio, of.since_ns = -math.inf, state.moving[robot].held.adrift_since_ns
     if of.ratio >= 0.0 and all_named:
         del state.evidence[robot]
-    if of.ratio > -SURE:
-        if of.fitted:
-            state.alternatives.pop(robot, None)
-            of.fitted = set()
-        return
-    old = _old(state, scan, of)
-    if (not of.fitted or robot not in state.alternatives) and (look is not None or scan.adrift or all_named):
-        _propose(state, scan, of, old)
-    if of.fitted and robot in state.alternatives:
-        _try(state, scan, of, old)
+    if of.ratio <= -SURE:
+        old, is_look = _old(state, scan, of), look is not None or scan.adrift or all_named
+        if is_look and not (of.fitted and robot in state.alternatives):
+            _propose(state, scan, of, old)
+        if of.fitted and robot in state.alternatives:
+            _try(state, scan, of, old)
+    elif of.fitted:
+        state.alternatives.pop(robot, None)
+        of.fitted = set()
 
 
 def _note(scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
