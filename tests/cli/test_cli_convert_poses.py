@@ -9,7 +9,8 @@ import pytest
 
 from command_line import Kalmark, write_log, write_log_of_space
 from kalmark.config import build_slam, open_run
-from kalmark.logs.poses import poses_in_space, read_path
+from kalmark.logs.log import poses_of_size
+from kalmark.logs.poses import read_path
 from kalmark.logs.source import Request, raise_refusal
 from kalmark.results.record import record
 from kalmark.results.run import Run
@@ -33,7 +34,7 @@ def test_a_run_s_path_is_written_and_scored_by_files_of_poses(kalmark: Kalmark, 
         assert kalmark("convert", "run", name).status == 0
         found = read_path(tmp_path / name, REQUEST)
         history = Run.load(tmp_path / "run").history
-        np.testing.assert_allclose(found.poses[:, :3], poses_in_space(history.poses)[:, :3], atol=1e-8)
+        np.testing.assert_allclose(found.poses[:, :3], poses_of_size(history.poses, 7)[:, :3], atol=1e-8)
     assert (tmp_path / "path.tum").read_text() == (tmp_path / "run" / "trajectory_rover.tum").read_text()
     scored = kalmark("evaluate", "run", "--truth", "path.tum")
     assert scored.status == 0 and "0.000" in scored.out

@@ -15,7 +15,8 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Fix, Scan
 from kalmark.geometry import frames3d, rotations
 from kalmark.logs import open_log
-from kalmark.logs.poses import poses_in_space, read_path, tum_text, write_path
+from kalmark.logs.log import poses_of_size
+from kalmark.logs.poses import read_path, tum_text, write_path
 from kalmark.logs.source import Request, raise_refusal
 
 REQUEST = Request(None, raise_refusal, [])
@@ -55,7 +56,7 @@ def test_another_library_reads_the_poses(tmp_path: Path) -> None:
 
 
 def test_poses_of_the_plane_are_at_height_0() -> None:
-    np.testing.assert_allclose(poses_in_space(np.array([[1, 2, np.pi]])), [[1, 2, 0, 0, 0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(poses_of_size(np.array([[1, 2, np.pi]]), 7), [[1, 2, 0, 0, 0, 1, 0]], atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import exp, left_jacobian_inverse, log, multiply
 from kalmark.geometry.spaces import RHO, VECTOR3, Space, retract
+from kalmark.logs.log import poses_of_size
 from kalmark.report import LandmarkTable
 from kalmark.results.evaluate import landmark_figures, line_figures
 from kalmark.results.landmark_table import MapLandmarks
@@ -21,7 +22,7 @@ from kalmark.results.measures import point_error, pose_error, rotation_error
 from kalmark.results.record import record
 from kalmark.results.recording import tum
 from kalmark.results.run import Run
-from kalmark.results.truth import ORIGIN, Truth, poses_of_size
+from kalmark.results.truth import ORIGIN, Truth
 from results_space import START, slam_for, spiral
 
 

@@ -87,7 +87,7 @@ class Look(NamedTuple):
     def scan(self, y: Array, ids: Any, keep: Any = slice(None)) -> Scan:
         """Return a scan at the same time with other measurements y (K, m) and ids of the rows `keep`."""
         e, cov = self.event, self.cov
-        return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=y, ids=ids, cov=None if cov is None else cov[keep])
+        return replace(e, y=y, ids=ids, cov=None if cov is None else cov[keep])
 
 
 class Recorded(NamedTuple):

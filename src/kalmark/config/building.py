@@ -208,8 +208,11 @@ def _placed(
     told = describe_place(at, world_of(said), cov, behind) if exact else {}
     for key in (section.model_fields_set & told.keys()) - {*EXACT}:
         if not np.allclose(said[key], told[key], rtol=1e-6, atol=1e-9):
-            what = f"expected {quote_value(told[key])} as its {' and '.join(exact)} says, or none of these beside it"
-            raise config.error((*path, key), f"got {quote_value(said[key])}, {what}")
+            raise config.error(
+                (*path, key),
+                f"got {quote_value(said[key])}, expected {quote_value(told[key])} as its {' and '.join(exact)} says, "
+                "or none of these beside it",
+            )
     return at, cov
 
 
@@ -220,8 +223,10 @@ def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov
     """
     readings = [event for event in log or () if isinstance(event, Control) and event.robot == name]
     if not readings:
-        what = f"{name} has no readings of its inertial unit yet, expected a log that begins at rest"
-        raise ModelError(f"{what}. Events one by one have none: {BY_SIGMAS}; km.motion.start_at_rest estimates them")
+        raise ModelError(
+            f"{name} has no readings of its inertial unit yet, expected a log that begins at rest. Events one by one "
+            f"have none: {BY_SIGMAS}; km.motion.start_at_rest estimates them"
+        )
     t_ns = np.array([event.t_ns for event in readings])
     seconds, u = (t_ns - t_ns[0]) * 1e-9, np.array([event.u for event in readings])
     try:
@@ -285,8 +290,9 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
     if idle and not did_you_mean(other, [sensor for sensor in mounts if sensor in used]):  # it has another name
         meant = next((each for each in idle if did_you_mean(other, [each])), idle[0])
         what = f"the log has no scans by it, expected {other!r} as in {where}"
-        hint = f"if that is another sensor, add robots.{key}.sensors.{other}"
-        raise config.error(("robots", key, "sensors", meant), f"{what}; {hint}")
+        raise config.error(
+            ("robots", key, "sensors", meant), f"{what}; if that is another sensor, add robots.{key}.sensors.{other}"
+        )
     known = f"one of {', '.join(mounts)}" if mounts else "none, as none is configured"
     what = f"{name} has scans of the sensor {other!r}, expected {known}"
     raise LogError(f"{where}: {what}; if it is another one, add robots.{key}.sensors.{other}")

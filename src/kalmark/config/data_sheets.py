@@ -84,8 +84,9 @@ def _take_preset(tree: Tree, where: tuple[str, ...], section: Any) -> None:
 
     place, given = tree.place((*where, "preset")), section.pop("preset")
     if not isinstance(given, str) or given not in MOTIONS:
-        got = f"{place}: {'.'.join((*where, 'preset'))}: got {quote_value(given)}"
-        raise ConfigError(f"{got}, expected one of {', '.join(MOTIONS)}")
+        raise ConfigError(
+            f"{place}: {'.'.join((*where, 'preset'))}: got {quote_value(given)}, expected one of {', '.join(MOTIONS)}"
+        )
     unit, names = MOTIONS[given].sensor, {own.name for own in parameters(class_of("motion", "inertial"))}
     section |= {name: getattr(unit, name) for name in MOTIONS[given].sources if name in names} | section
 

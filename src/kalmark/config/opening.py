@@ -234,5 +234,7 @@ def refuse_idle(tree: Tree, log: Log) -> None:
         if path[:1] != ("robots",) or len(path) < 2 or path[1] in (*log.robots, EACH) or not place.startswith(OVERRIDE):
             continue
         near = did_you_mean(path[1], log.robots)
-        wanted = f"one of {', '.join(log.robots)}{near}"
-        raise ConfigError(f"{place}: robots.{path[1]}: got a robot that is not in this log or run, expected {wanted}")
+        raise ConfigError(
+            f"{place}: robots.{path[1]}: got a robot that is not in this log or run, expected one of "
+            f"{', '.join(log.robots)}{near}"
+        )

@@ -206,18 +206,15 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
     space = any(len(u) == 6 for u, _ in graph.moves.values()) or any(len(p) == 7 for p in graph.poses.values())
     size, d = (6, 3) if space else (3, 2)
     t_ns = {one: k * STEP_NS for k, one in enumerate(ids)}
+    if any(len(u) != size for u, _ in graph.moves.values()):
+        raise LogError(f"{path}: edges of the plane and of space, expected one kind")
     events: list[Event] = []
     for a, b in pairwise(ids):
         if (a, b) not in graph.moves:
             raise LogError(f"{path}: no edge from pose {a} to pose {b}, expected one from each pose to the next")
         u, C = graph.moves[a, b]
-        if len(u) != size:
-            raise LogError(f"{path}: edges of the plane and of space, expected one kind")
         events.append(Control(t_ns=t_ns[b], robot=ROBOT, u=u, cov=C))
-    loops = _loops(graph, ids, t_ns)
-    if any(e.width not in (0, size) for e in loops):
-        raise LogError(f"{path}: edges of the plane and of space, expected one kind")
-    events += loops
+    scans = _loops(graph, ids, t_ns)
     for (name, at), seen in graph.sights.items():
         numbers = 1 if name == BEARINGS and not space else d
         first = {one: (y, C) for one, y, C in reversed(seen)}
@@ -228,25 +225,24 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
             world = "space" if space else "the plane"
             raise LogError(f"{path}: pose {at} has observations of another world, expected those of {world}")
         y, cov = [y for y, _ in first.values()], [C for _, C in first.values()]
-        events.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=name, y=y, ids=[*first], cov=cov))
-    sensor: dict[str, Any] = {"type": "position_3d" if space else "position"}
-    if graph.offset is not None:
-        sensor["mount"] = describe_pose(graph.offset)
-    told: dict[str, Any] = {"motion": {"type": "odometry_3d" if space else "odometry_2d"}}
-    there = {name for name, _ in graph.sights}
-    told["sensors"] = {SENSOR: sensor} if SENSOR in there else {}
-    told["sensors"] |= (
-        {BEARINGS: {"type": "bearing", "initialization": {"type": "delayed"}}} if BEARINGS in there else {}
-    )
-    told["sensors"] |= {LOOPS: {"type": "odometer", "keep": 0}} if loops else {}
+        scans.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=name, y=y, ids=[*first], cov=cov))
+    steps, mount = INCREMENT3 if space else INCREMENT2, graph.offset
+    known: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+        SENSOR: ({"type": "position_3d" if space else "position"}, POSITION[:d]),
+        BEARINGS: ({"type": "bearing", "initialization": {"type": "delayed"}}, BEAM[1:]),
+        LOOPS: ({"type": "odometer", "keep": 0}, steps),
+    }
+    if mount is not None:
+        known[SENSOR][0]["mount"] = describe_pose(mount)
+    there = {scan.sensor for scan in scans}
+    sections = {name: section for name, (section, _) in known.items() if name in there}
+    columns = {name: names for name, (_, names) in known.items() if name in there}
+    told = {"motion": {"type": "odometry_3d" if space else "odometry_2d"}, "sensors": sections}
     rest: dict[str, Any] = {"describes": {"robots": {ROBOT: told}}, "name": path.stem}
     if true and graph.poses:
         path_ = Trajectory.of({t_ns[one]: graph.poses[one] for one in sorted(graph.poses)})
         rest |= {"truth": {ROBOT: path_}, "landmarks": graph.places}
-    steps = INCREMENT3 if space else INCREMENT2
-    columns = {SENSOR: POSITION[:d]} if SENSOR in there else {}
-    columns |= ({BEARINGS: BEAM[1:]} if BEARINGS in there else {}) | ({LOOPS: steps} if loops else {})
-    return one_robot("g2o", path, request, ROBOT, events, steps, columns, **rest)
+    return one_robot("g2o", path, request, ROBOT, [*events, *scans], steps, columns, **rest)
 
 
 def _loops(graph: Graph, ids: list[int], t_ns: dict[int, int]) -> list[Scan]:

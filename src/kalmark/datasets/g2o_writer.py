@@ -53,8 +53,10 @@ def graph(run: Run, log: Log, robots: Mapping[str, Robot]) -> Iterator[str]:
     for name, sensor in log.sensor_columns:
         columns = tuple(robots[name].sensors[sensor].sensor.columns) if name in robots else POINTS[0]
         if columns not in (*POLAR, *POINTS):
-            told = f"the scans of {name} by {sensor} have {', '.join(columns)}"
-            raise RunError(f"{told}, expected positions, or ranges with bearings: g2o has points")
+            raise RunError(
+                f"the scans of {name} by {sensor} have {', '.join(columns)}, expected positions, or ranges with "
+                "bearings: g2o has points"
+            )
     history, d = run.history, run.history.d
     rows: dict[int, list[int]] = {}
     for row in np.flatnonzero(history.fused & (history.landmark != "")).tolist():

@@ -102,8 +102,10 @@ def read_truth(path: Path) -> tuple[dict[str, Trajectory], dict[Id, Array]]:
         return {}, {}
     data = arrays(path, ("GT", "TL"))
     if data["GT"].shape[1:] != (4,) or data["TL"].shape[1:] != (3,):
-        shapes = f"GT {data['GT'].shape}, TL {data['TL'].shape}"
-        raise LogError(f"{path}: shapes are {shapes}, expected 4 columns (time, x, y, heading) and 3 (beacon, x, y)")
+        raise LogError(
+            f"{path}: shapes are GT {data['GT'].shape}, TL {data['TL'].shape}, expected 4 columns (time, x, y, "
+            "heading) and 3 (beacon, x, y)"
+        )
     t_ns = np.rint(data["GT"][:, 0] * 1e9).astype(np.int64)
     beacons: dict[Id, Array] = {int(row[0]): row[1:].copy() for row in data["TL"]}
     return {ROBOT: Trajectory(t_ns, data["GT"][:, 1:])}, beacons

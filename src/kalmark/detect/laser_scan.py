@@ -113,7 +113,7 @@ class Laser:
             raise EventError(f"{label_of_event(scan)}: {error}") from None
         size = max(self.given, 3 if self.signature else 0)
         y, cov = found.y[:, :size], found.cov[:, :size, :size]
-        return Scan(t_ns=scan.t_ns, robot=scan.robot, sensor=scan.sensor, y=y, cov=cov if len(y) else None)
+        return replace(scan, y=y, ids=None, cov=cov if len(y) else None)
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
         raise NotImplementedError

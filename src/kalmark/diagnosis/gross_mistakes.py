@@ -405,8 +405,8 @@ def _without(e: Event, names: set[str]) -> Event:
 def _rows_of(e: Scan, rows: list[int]) -> Scan:
     """Return a scan with some of its observations."""
     cov = e.cov[rows] if e.cov is not None and e.cov.ndim == 3 else e.cov
-    ids = None if e.ids is None else [e.ids[k] for k in rows]
-    return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y[rows], ids=ids, cov=cov)
+    ids = None if e.ids is None else tuple(e.ids[k] for k in rows)
+    return replace(e, y=e.y[rows], ids=ids, cov=cov)
 
 
 def find_exchanged_ids(run: Run, log: Log, now: Fit) -> Mistake | None:

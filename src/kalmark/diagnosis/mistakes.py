@@ -16,7 +16,6 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.events import Control, Event, Scan
-from kalmark.logs.log_corrections import event_at_time
 from kalmark.results.figure_texts import figure
 from kalmark.results.run import Run
 from kalmark.slam.robot import Robot
@@ -186,7 +185,7 @@ def late_scans(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
     by_ns = round(by_s * 1e9)
     return Mistake(
         LATE, evidence, cure, config,
-        lambda e: event_at_time(e, e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e,
+        lambda e: replace(e, t_ns=e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e,
     )  # fmt: skip
 
 
@@ -223,7 +222,7 @@ def change_measurements(sensors: set[Where], change: Callable[[Array], Array]) -
 
     def changed(e: Event) -> Event:
         if isinstance(e, Scan) and len(e.y) and (e.robot, e.sensor) in sensors:
-            return event_at_time(e, e.t_ns, change(e.y))
+            return replace(e, y=change(e.y))
         return e
 
     return changed
@@ -234,4 +233,4 @@ def _controlled(robot: str, change: Callable[[Array], Array]) -> Change:
 
 
 def _at(factor: float) -> Change:
-    return lambda e: event_at_time(e, round(e.t_ns * factor))
+    return lambda e: replace(e, t_ns=round(e.t_ns * factor))

@@ -61,8 +61,10 @@ def read_calibration(path: Path, camera: str | None = None) -> dict[str, Any]:
             f"{path}: no camera {camera!r}, expected one of {', '.join(filter(None, found)) or 'none'}{hint}"
         )
     if not found:
-        wanted = "camera_matrix, intrinsics, or fx, fy, cx, cy"
-        raise LogError(f"{path}: no calibration of a camera, expected {wanted} of OpenCV, ROS, Kalibr or EuRoC")
+        raise LogError(
+            f"{path}: no calibration of a camera, expected camera_matrix, intrinsics, or fx, fy, cx, cy of OpenCV, "
+            "ROS, Kalibr or EuRoC"
+        )
     if camera is None and len(found) > 1:
         raise LogError(f"{path}: the cameras {', '.join(found)}, expected the name of one of them")
     return _Calibration(path, found[next(iter(found)) if camera is None else camera]).section()

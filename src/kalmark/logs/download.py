@@ -143,8 +143,10 @@ def _not_fetched(name: str) -> DataError:
         return DataError(f"dataset {plain!r} cannot be fetched, expected a copy of your own: put {own[plain]}")
     near = [one for one in (*names, *own) if name and one.lower().startswith(plain.lower())]
     hint = f"; did you mean {' or '.join(map(repr, near))}?" if near else spelling_hint(name, (*names, *own))
-    known = f"one of {', '.join(names)}, or, as a copy of your own, {', '.join(own)}"
-    return DataError(f"dataset {name!r} is unknown, expected {known}{hint}")
+    return DataError(
+        f"dataset {name!r} is unknown, expected one of {', '.join(names)}, or, as a copy of your own, "
+        f"{', '.join(own)}{hint}"
+    )
 
 
 def fetch_one(dataset: Dataset, progress: Progress | None) -> Path:

@@ -143,8 +143,10 @@ def with_poses(
     true = {robot: read_path(path, request) for robot, path in _by_robot(log, "truth", truth).items()}
     places = {robot: read_path(path, request) for robot, path in _by_robot(log, "fixes", fixes).items()}
     if (sigma_m is None) != (fixes is None) or (sigma_m is None and sigma_z_m is not None):
-        both = f"fixes is {short_text(fixes)} and sigma_fixes_m is {short_text(sigma_m)}"
-        raise LogError(f"log option {both}, expected both: a file of positions and their noise")
+        raise LogError(
+            f"log option fixes is {short_text(fixes)} and sigma_fixes_m is {short_text(sigma_m)}, expected both: a "
+            "file of positions and their noise"
+        )
     given = ((sigma_m, "sigma_fixes_m"), (sigma_z_m, "sigma_fixes_z_m"))
     sigmas = [quantity(sigma, name, 1e-9) for sigma, name in given if sigma is not None]
     events = [
@@ -162,8 +164,10 @@ def _by_robot(log: Log, name: str, given: Any) -> dict[str, Path]:
     files = given if isinstance(given, Mapping) else {} if given is None else dict.fromkeys(log.robots, given)
     for robot in files:
         if robot not in log.robots or (len(files) > 1 and not isinstance(given, Mapping)):
-            wanted = f"a file, or one for each of the robots {', '.join(log.robots)}: {{robot: file}}"
-            raise LogError(f"log option {name} is {short_text(given)}, expected {wanted}")
+            raise LogError(
+                f"log option {name} is {short_text(given)}, expected a file, or one for each of the robots "
+                f"{', '.join(log.robots)}: {{robot: file}}"
+            )
     return {robot: find_data(path) for robot, path in files.items()}
 
 
@@ -253,9 +257,9 @@ def remove_sightings(event: Event, others: set[str], left_out: Counter[str]) -> 
     keep = np.array([id_ not in others for id_ in event.ids])
     if not keep.any():
         return None
-    ids = [id_ for id_ in event.ids if id_ not in others]
+    ids = tuple(id_ for id_ in event.ids if id_ not in others)
     cov = event.cov[keep] if event.cov is not None and event.cov.ndim == 3 else event.cov
-    return Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor, y=event.y[keep], ids=ids, cov=cov)
+    return replace(event, y=event.y[keep], ids=ids, cov=cov)
 
 
 def clip_time(log: Log, from_s: float | None, to_s: float | None) -> Log:
@@ -285,7 +289,7 @@ def hide_ids(log: Log) -> Log:
         if isinstance(event, Scan) and event.ids is not None:
             if log.sensor_columns.get((event.robot, event.sensor)) in (INCREMENT2, INCREMENT3):
                 continue  # times of earlier scans
-            ids = [i if i in log.robots else None for i in event.ids]
-            hidden = Scan(t_ns=event.t_ns, robot=event.robot, sensor=event.sensor, y=event.y, ids=ids, cov=event.cov)
-            events[n], true_ids[hidden] = hidden, event.ids
+            ids = tuple(i if i in log.robots else None for i in event.ids)
+            events[n] = hidden = replace(event, ids=ids)
+            true_ids[hidden] = event.ids
     return replace(log, events=events, true_ids=true_ids)

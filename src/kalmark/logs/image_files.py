@@ -29,8 +29,9 @@ def opencv(path: Path) -> Any:
     try:
         import cv2
     except ImportError:
-        hint = "`pip install 'kalmark[opencv]'`"
-        raise LogError(f"{path}: images need the library OpenCV, expected it installed: {hint}") from None
+        raise LogError(
+            f"{path}: images need the library OpenCV, expected it installed: `pip install 'kalmark[opencv]'`"
+        ) from None
     return cv2
 
 

@@ -35,8 +35,9 @@ class Trajectory:
     def __post_init__(self) -> None:
         t_ns, poses = np.asarray(self.t_ns, dtype=np.int64), np.asarray(self.poses, dtype=np.float64)
         if poses.ndim != 2 or poses.shape[1] not in (3, 7) or t_ns.shape != poses.shape[:1] or len(t_ns) == 0:
-            shapes = f"t_ns has shape {t_ns.shape} and poses {poses.shape}"
-            raise LogError(f"trajectory: {shapes}, expected (N,) and (N, 3|7)")
+            raise LogError(
+                f"trajectory: t_ns has shape {t_ns.shape} and poses {poses.shape}, expected (N,) and (N, 3|7)"
+            )
         if not np.isfinite(poses).all():
             raise LogError("trajectory: poses hold a value that is not finite, expected finite numbers")
         if not (np.diff(t_ns) > 0).all():
@@ -94,6 +95,18 @@ def slerp(p: Array, q: Array, a: Array) -> Array:
     return np.where((a == 0)[:, None], p, out)
 
 
+def poses_of_size(poses: Array, size: int) -> Array:
+    """Return poses (N, 3) or (N, 7) as poses of the plane (size 3: seen from above) or of space (size 7: at z = 0)."""
+    if poses.shape[1] == size:
+        return poses
+    if size == 3:
+        x, y, z, w = poses[:, 3:].T
+        yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))  # where their x points
+        return np.column_stack([poses[:, :2], yaw])
+    flat, half = np.zeros(len(poses)), poses[:, 2] / 2
+    return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
+
+
 @dataclass(frozen=True, eq=False)
 class PositionTrack:
     """Position fixes that only score a run.
@@ -113,8 +126,10 @@ class PositionTrack:
         t_ns, xy = np.asarray(self.t_ns, dtype=np.int64), np.asarray(self.xy, dtype=np.float64)
         antenna = np.asarray(self.antenna, dtype=np.float64)
         if xy.shape != (*t_ns.shape, 2) or antenna.shape != (2,):
-            shapes = f"t_ns {t_ns.shape}, xy {xy.shape}, antenna {antenna.shape}"
-            raise LogError(f"position track: shapes are {shapes}, expected (N,), (N, 2), (2,)")
+            raise LogError(
+                f"position track: shapes are t_ns {t_ns.shape}, xy {xy.shape}, antenna {antenna.shape}, expected "
+                "(N,), (N, 2), (2,)"
+            )
         for name, value in (("t_ns", t_ns), ("xy", xy), ("antenna", antenna)):
             object.__setattr__(self, name, value)
 

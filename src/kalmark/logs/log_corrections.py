@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Raw, Scan, sort_key
+from kalmark.events import Control, Event, Fix, Raw, sort_key
 from kalmark.logs.log import Log
 from kalmark.logs.source import quantity, spelling_hint
 
@@ -59,9 +59,10 @@ def _refuse_idle(option: str, given: Mapping[Path_, float], known: list[Path_]) 
     for path in given:
         if not any(path[-1] in of[-1:] + (of if option == "shift_s" else ()) and {*path} <= {*of} for of in known):
             names = [*dict.fromkeys(of[-1] for of in known)]
-            wanted = f"{', '.join(names) or 'none'}{spelling_hint(path[-1], names)}"
-            told = f"{option}.{'.'.join(path)} is of nothing in this log"
-            raise LogError(f"log option {told}, expected robots and sensors of the log and one of {wanted}")
+            raise LogError(
+                f"log option {option}.{'.'.join(path)} is of nothing in this log, expected robots and sensors of the "
+                f"log and one of {', '.join(names) or 'none'}{spelling_hint(path[-1], names)}"
+            )
 
 
 def _product(factors: Mapping[Path_, float], path: Path_) -> float:
@@ -70,27 +71,19 @@ def _product(factors: Mapping[Path_, float], path: Path_) -> float:
     return float(np.prod([1.0, *mine]))
 
 
-def event_at_time(event: Event, t_ns: int, y: Array | None = None, cov: Array | None = None) -> Event:
-    """Return an event at another time, and a scan with other measurements and noise, if these are given."""
-    if not isinstance(event, Scan):
-        return replace(event, t_ns=t_ns)
-    y, cov = event.y if y is None else y, event.cov if cov is None else cov
-    return Scan(t_ns=t_ns, robot=event.robot, sensor=event.sensor, y=y, ids=event.ids, cov=cov)
-
-
 def _event(event: Event, factors: Mapping[Path_, Array], late: Mapping[Path_, float], times: float) -> Event:
     t_ns = event.t_ns if times == 1.0 else round(event.t_ns * times)
     if isinstance(event, Fix):
-        return event_at_time(event, t_ns)
+        return replace(event, t_ns=t_ns)
     path = (event.robot,) if isinstance(event, Control) else (event.robot, event.sensor)
     t_ns += round(late.get(path, 0.0) * 1e9)
     if isinstance(event, Raw):
-        return event_at_time(event, t_ns)
+        return replace(event, t_ns=t_ns)
     by = factors.get(path, np.ones(1))
     cov = None if event.cov is None else event.cov * np.outer(by, by)
     if isinstance(event, Control):
         return replace(event, t_ns=t_ns, u=event.u * by, cov=cov)
-    return event_at_time(event, t_ns, event.y * by if len(event.y) else None, cov)
+    return replace(event, t_ns=t_ns, y=event.y * by if len(event.y) else event.y, cov=cov)
 
 
 def _scaled(t_ns: Any, times: float) -> Any:

@@ -63,8 +63,7 @@ def sheet(name: str, table: Any) -> Content:
     sizes = {each: len(v) for each, v in filled.items()}
     for each, size in sizes.items():
         if size != sizes[names[0]]:
-            wanted = f"{sizes[names[0]]} as {names[0]!r} has"
-            raise LogError(f"{name}: column {each!r} has {size} values, expected {wanted}")
+            raise LogError(f"{name}: column {each!r} has {size} values, expected {sizes[names[0]]} as {names[0]!r} has")
     return Content([*filled], name, enumerate(zip(*filled.values(), strict=True), start=1), " row ")
 
 

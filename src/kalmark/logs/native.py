@@ -176,8 +176,7 @@ class _Reader:
 
         def make(row: Row) -> Event:
             self.note(row)
-            u = row.values(self.columns)
-            cov = row.own_noise(self.columns[row.key], definite=False)
+            u, cov = row.measured(self.columns, definite=False)
             return Control(t_ns=row.t_ns, robot=row.robot, u=u, cov=cov)
 
         return read_table(path, ("t_s", "robot"), known=known_columns(CONTROL)).made(self.request, make)
@@ -222,8 +221,7 @@ class _Reader:
         rows.empty = empty
         if empty:
             return
-        y = row.values(self.columns)
-        cov, name = row.own_noise(self.columns[row.key], definite=True), row.id()
+        (y, cov), name = row.measured(self.columns), row.id()
         if name is not None and name in rows.ids:
             first = rows.lines[rows.ids.index(name)]
             raise Refused(f"id {name!r} is in this scan already (line {first}), expected each landmark once")
@@ -239,8 +237,7 @@ class _Reader:
 
         def make(row: Row) -> Event:
             self.note(row)
-            y = row.values(self.columns)
-            cov = row.own_noise(self.columns[row.key], definite=True)
+            y, cov = row.measured(self.columns)
             return Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov)
 
         table = read_table(path, ("t_s", "robot", "sensor"), known=known_columns(), globe=self.globe)
@@ -271,8 +268,7 @@ class _Reader:
 
         def make(row: Row) -> Event:
             self.note(row)
-            y = row.values(columns)
-            cov = row.own_noise(columns[row.key], definite=True)
+            y, cov = row.measured(columns)
             if cov is None:
                 raise Refused("the fix has no noise, expected a covariance in m^2")
             return Fix(t_ns=row.t_ns, robot=row.robot, y=y, cov=cov)
@@ -286,8 +282,7 @@ class _Reader:
             odd = next((name for name in table.value_columns if name not in (*POSE2, *POSE3)), None)
             hint = spelling_hint(odd, (*POSE2, *POSE3)) if odd else ""
             given = ", ".join(table.value_columns) or "of a pose: none"
-            wanted = f"either {', '.join(POSE2)} or {', '.join(POSE3)}"
-            raise LogError(f"{path}:1: columns {given}, expected {wanted}{hint}")
+            raise LogError(f"{path}:1: columns {given}, expected either {', '.join(POSE2)} or {', '.join(POSE3)}{hint}")
         columns = POSE2 if "theta_rad" in table.value_columns else POSE3
         paths: dict[str, dict[int, list[float]]] = {}
 
@@ -359,8 +354,10 @@ def _by_time(path: Path, events: Iterator[Event]) -> Iterator[Event]:
     last_ns = None
     for t_ns, same in groupby(events, key=lambda event: event.t_ns):
         if last_ns is not None and t_ns < last_ns:
-            told = f"an event at {fixed_seconds(t_ns)} s after one at {fixed_seconds(last_ns)} s"
-            raise LogError(f"{path}: {told}, expected rows in the order of time: only these can be read one by one")
+            raise LogError(
+                f"{path}: an event at {fixed_seconds(t_ns)} s after one at {fixed_seconds(last_ns)} s, expected rows "
+                "in the order of time: only these can be read one by one"
+            )
         last_ns = t_ns
         yield from sorted(same, key=sort_key)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,11 @@ from kalmark.logs.log import Log
 from kalmark.logs.native import FILES, LANDMARKS, RIG
 from kalmark.logs.source import landmark_id, nanoseconds_of_text
 from kalmark.logs.table import PARQUET, cov_columns
-from kalmark.logs.table_columns import CANONICAL, GPS, POSE2, POSE3, POSITION
+from kalmark.logs.table_columns import CANONICAL, GPS, NAMES, POSE2, POSE3, POSITION
 
-Table = tuple[list[str], list[dict[str, str]]]
+Row = dict[str, str]
 FRAMES, IMAGES = "frames.csv", "images"
 PICTURES = "image", "depth", "right"  # columns of FRAMES that name files
-EMPTY: Table = ([], [])  # measurements.csv: what has no id is written into scans.csv, too
 
 
 def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path:
@@ -42,23 +41,27 @@ def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path
     """
     folder = Path(folder)
     own = [*FILES, RIG, *(str(Path(name).with_suffix(PARQUET)) for name in FILES)]
-    tables = (
-        controls_table(log),
-        scans_table(log),
-        fixes_table(log),
-        truth(log),
-        landmarks_table(log),
-        gps(log),
-        EMPTY,
-    )
-    replace_folder(folder, lambda made: _fill(made, log, (*tables, frames_table(log, made)), parquet), own, FILES[0])
+    replace_folder(folder, lambda made: _fill(made, log, parquet), own, FILES[0])
     return folder
 
 
-def _fill(folder: Path, log: Log, tables: Sequence[Table], parquet: bool) -> None:
-    for file_name, (header, rows) in zip(FILES, tables, strict=True):
+def _fill(folder: Path, log: Log, parquet: bool) -> None:
+    tables = {  # measurements.csv: what has no id is written into scans.csv, too
+        "controls.csv": controls(log), "scans.csv": scans(log), "fixes.csv": fixes(log), "truth.csv": truth(log),
+        "landmarks.csv": landmarks(log), "gps.csv": gps(log), FRAMES: frames(log, folder),
+    }  # fmt: skip
+    for file_name, made in tables.items():
+        rows = [*made]
         if not rows:
             continue
+        header = header_of(rows)
+        for used in (*log.control_columns.values(), *log.sensor_columns.values()):
+            there = [name for name in header if name in used]
+            if len(there) == len(used) and there != [*used]:
+                raise LogError(
+                    f"columns {', '.join(used)} would be read back in another order, expected that of "
+                    f"{', '.join(there)}"
+                )
         if parquet and file_name != FRAMES:
             write_parquet((folder / file_name).with_suffix(PARQUET), header, rows)
             continue
@@ -71,7 +74,15 @@ def _fill(folder: Path, log: Log, tables: Sequence[Table], parquet: bool) -> Non
             YAML(typ="safe", pure=True).dump(log.describes, file)
 
 
-def write_parquet(path: Path, header: list[str], rows: list[dict[str, str]]) -> None:
+def header_of(rows: Sequence[Row]) -> list[str]:
+    """Return the columns of a table: names, numbers in the order in which they are read back, noise."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    known = [name for name in (*NAMES, *CANONICAL, *PICTURES) if name in names]
+    noise = sorted(name for name in names if name.startswith("cov_"))
+    return [*known, *(name for name in names if name not in (*known, *noise)), *noise]
+
+
+def write_parquet(path: Path, header: Sequence[str], rows: Sequence[Row]) -> None:
     """Write a table as Parquet: times in ns, texts, and numbers to the last bit; what is empty is null."""
     import pyarrow
     import pyarrow.parquet
@@ -87,53 +98,41 @@ def write_parquet(path: Path, header: list[str], rows: list[dict[str, str]]) -> 
     pyarrow.parquet.write_table(pyarrow.table(columns), path)
 
 
-def controls_table(log: Log) -> Table:
-    """Return header and rows of controls.csv."""
-    events = [event for event in log if isinstance(event, Control)]
-    columns = union(check_columns(log.control_columns, c.robot, len(c.u)) for c in events)
-    if part := next((c for c in events if c.share < 1), None):
-        raise LogError(
-            f"the control at {fixed_seconds(part.t_ns)} s is a part, expected whole increments: those 'recorded'"
-        )
-    noise = cov_columns(max((len(c.cov) for c in events if c.cov is not None), default=0))
-    rows = [
-        time_and_robot(c)
-        | cells(columns, log.control_columns[c.robot], c.u)
-        | upper_triangle(c.cov, f"control at {c.t_s} s")
-        for c in events
-    ]
-    return ["t_s", "robot", *columns, *noise], rows
+def controls(log: Log) -> Iterator[Row]:
+    """Yield the rows of controls.csv."""
+    for c in log:
+        if not isinstance(c, Control):
+            continue
+        if c.share < 1:
+            raise LogError(
+                f"the control at {fixed_seconds(c.t_ns)} s is a part, expected whole increments: those 'recorded'"
+            )
+        noise = upper_triangle(c.cov, f"control at {c.t_s} s")
+        yield time_and_robot(c) | numbers(log.control_columns, c.robot, c.u) | noise
 
 
-def scans_table(log: Log) -> Table:
-    """Return header and rows of scans.csv."""
-    events = [event for event in log if isinstance(event, Scan)]
-    columns = union(check_columns(log.sensor_columns, (s.robot, s.sensor), s.y.shape[1]) for s in events if len(s.y))
-    noise = cov_columns(max((s.y.shape[1] for s in events if s.cov is not None), default=0))
-    rows: list[dict[str, str]] = []
+def scans(log: Log) -> Iterator[Row]:
+    """Yield the rows of scans.csv."""
     seen: set[tuple[int, str, str]] = set()
-    for s in events:
-        key = (s.t_ns, s.robot, s.sensor)
-        if key in seen:
+    for s in log:
+        if not isinstance(s, Scan):
+            continue
+        if (s.t_ns, s.robot, s.sensor) in seen:
             raise LogError(
                 f"two scans of {s.robot!r} by {s.sensor!r} at t={fixed_seconds(s.t_ns)} s, expected one at a time"
             )
-        seen.add(key)
-        begin = time_and_robot(s) | {"sensor": name(s.sensor)}
-        if len(s.y) == 0:
-            rows.append(begin)
-            continue
-        used, size = log.sensor_columns[s.robot, s.sensor], s.y.shape[1]
-        covs = [None] * len(s.y) if s.cov is None else np.broadcast_to(s.cov, (len(s.y), size, size))
-        for y, id_, cov in zip(s.y, s.ids or [None] * len(s.y), covs, strict=True):
-            told = {} if id_ is None else {"id": id_text(id_)}
-            rows.append(begin | told | cells(columns, used, y) | upper_triangle(cov, f"scan at {s.t_s} s"))
-    return ["t_s", "robot", "sensor", "id", *columns, *noise], rows
+        seen.add((s.t_ns, s.robot, s.sensor))
+        begin, (count, size) = time_and_robot(s) | {"sensor": name(s.sensor), "id": ""}, s.y.shape
+        if not count:
+            yield begin
+        covs = [None] * count if s.cov is None else np.broadcast_to(s.cov, (count, size, size))
+        for y, id_, cov in zip(s.y, s.ids or [None] * count, covs, strict=True):
+            own = numbers(log.sensor_columns, (s.robot, s.sensor), y) | upper_triangle(cov, f"scan at {s.t_s} s")
+            yield begin | ({} if id_ is None else {"id": id_text(id_)}) | own
 
 
-def frames_table(log: Log, folder: Path) -> Table:
-    """Return header and rows of frames.csv, and write the images below the folder: IMAGES/SENSOR/NANOSECONDS.png."""
-    rows: list[dict[str, str]] = []
+def frames(log: Log, folder: Path) -> Iterator[Row]:
+    """Yield the rows of frames.csv, and write the images below the folder: IMAGES/SENSOR/NANOSECONDS.png."""
     for frame in log:
         if not isinstance(frame, Frame):
             continue
@@ -146,87 +145,63 @@ def frames_table(log: Log, folder: Path) -> Table:
             (folder / place).parent.mkdir(parents=True, exist_ok=True)
             write(folder / place, pixels)
             row[column] = place.as_posix()
-        rows.append(row)
-    return ["t_s", "robot", "sensor", *(c for c in PICTURES if c == "image" or any(c in row for row in rows))], rows
+        yield row
 
 
-def fixes_table(log: Log) -> Table:
-    """Return header and rows of fixes.csv."""
-    events = [event for event in log if isinstance(event, Fix)]
-    size = max((len(f.y) for f in events), default=2)
-    rows = [
-        time_and_robot(f) | texts_of_columns(POSITION, f.y) | upper_triangle(f.cov, f"fix at {f.t_s} s", "xyz")
-        for f in events
-    ]
-    return ["t_s", "robot", *POSITION[:size], *cov_columns(size, "xyz")], rows
+def fixes(log: Log) -> Iterator[Row]:
+    """Yield the rows of fixes.csv."""
+    for f in log:
+        if isinstance(f, Fix):
+            noise = upper_triangle(f.cov, f"fix at {f.t_s} s", "xyz")
+            yield time_and_robot(f) | texts_of_columns(POSITION, f.y) | noise
 
 
-def truth(log: Log) -> Table:
-    """Return header and rows of truth.csv."""
+def truth(log: Log) -> Iterator[Row]:
+    """Yield the rows of truth.csv."""
     sizes = {path.poses.shape[1] for path in log.truth.values()}
     if len(sizes) > 1:
         raise LogError("truth holds poses in the plane and in space, expected one kind")
-    columns = POSE3 if sizes == {7} else POSE2
-    rows = [
-        {"t_s": fixed_seconds(int(t)), "robot": name(robot)} | texts_of_columns(columns, pose)
-        for robot, path in log.truth.items() for t, pose in zip(path.t_ns, path.poses, strict=True)
-    ]  # fmt: skip
-    return ["t_s", "robot", *columns], rows
+    for robot, path in log.truth.items():
+        for t, pose in zip(path.t_ns.tolist(), path.poses, strict=True):
+            told = texts_of_columns(POSE3 if sizes == {7} else POSE2, pose)
+            yield {"t_s": fixed_seconds(t), "robot": name(robot)} | told
 
 
-def landmarks_table(log: Log) -> Table:
-    """Return header and rows of landmarks.csv."""
+def landmarks(log: Log) -> Iterator[Row]:
+    """Yield the rows of landmarks.csv."""
     of_size = {len(names): names for names in LANDMARKS}
     sizes = {len(values) for values in log.landmarks.values()}
     if not (sizes <= {2, 4} or sizes <= {3, 6, 7}):
         raise LogError(f"landmarks have {', '.join(map(str, sorted(sizes)))} numbers, expected 2 and 4, or 3, 6 and 7")
-    columns = union(of_size[size] for size in sorted(sizes)) or LANDMARKS[0]
-    rows = [{"id": id_text(id_)} | cells(columns, of_size[len(l)], l) for id_, l in log.landmarks.items()]
-    return ["id", *columns], rows
+    return ({"id": id_text(id_)} | texts_of_columns(of_size[len(l)], l) for id_, l in log.landmarks.items())
 
 
-def gps(log: Log) -> Table:
-    """Return header and rows of gps.csv."""
-    rows = [
-        {"t_s": fixed_seconds(int(t)), "robot": name(robot)} | texts_of_columns(GPS, [*xy, *track.antenna])
-        for robot, track in log.gps.items() for t, xy in zip(track.t_ns, track.xy, strict=True)
-    ]  # fmt: skip
-    return ["t_s", "robot", *GPS], rows
+def gps(log: Log) -> Iterator[Row]:
+    """Yield the rows of gps.csv."""
+    for robot, track in log.gps.items():
+        for t, xy in zip(track.t_ns.tolist(), track.xy, strict=True):
+            yield {"t_s": fixed_seconds(t), "robot": name(robot)} | texts_of_columns(GPS, [*xy, *track.antenna])
 
 
-def time_and_robot(event: Event) -> dict[str, str]:
+def time_and_robot(event: Event) -> Row:
     """Return the cells of an event's time and robot."""
     return {"t_s": fixed_seconds(event.t_ns), "robot": name(event.robot)}
 
 
-def check_columns(columns: dict[Any, tuple[str, ...]], key: Any, size: int) -> tuple[str, ...]:
-    """Return the column names of a control or scan.  Raises LogError if the log does not name them."""
+def numbers(columns: dict[Any, tuple[str, ...]], key: Any, values: Array) -> Row:
+    """Return the numbers (m,) of a control or an observation by column.  Raises LogError if the log names none."""
     names = columns.get(key)
-    if names is None or len(names) != size:
-        raise LogError(f"columns of {key!r} are {names!r}, expected the names of its {size} numbers")
-    return names
+    if names is None or len(names) != len(values):
+        raise LogError(f"columns of {key!r} are {names!r}, expected the names of its {len(values)} numbers")
+    return texts_of_columns(names, values)
 
 
-def union(columns: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
-    """Return all column names, in the order in which they are read back."""
-    names = list(dict.fromkeys(name for group in dict.fromkeys(columns) for name in group))
-    known = [name for name in CANONICAL if name in names]
-    return (*known, *(name for name in names if name not in known))
-
-
-def cells(columns: tuple[str, ...], used: tuple[str, ...], values: Array) -> dict[str, str]:
-    """Return the cells of `values`, named by `used`, some of `columns`.  Raises LogError if their order is another."""
-    if columns != used and tuple(column for column in columns if column in used) != used:
-        raise LogError(f"columns {', '.join(used)} would be read back in another order, expected that of {columns}")
-    return texts_of_columns(used, values)
-
-
-def texts_of_columns(columns: Sequence[str], values: Any) -> dict[str, str]:
+def texts_of_columns(columns: Sequence[str], values: Any) -> Row:
     """Return numbers by column, as the shortest text that reads back as the same float."""
     return {column: repr(float(value)) for column, value in zip(columns, values, strict=False)}
 
 
-def upper_triangle(cov: Array | None, what: str, axes: str = "0123456789") -> dict[str, str]:
+def upper_triangle(cov: Array | None, what: str, axes: str = "0123456789") -> Row:
     """Return the cells of the upper triangle of a covariance, row by row.  Raises LogError if it is not symmetric."""
     if cov is None:
         return {}

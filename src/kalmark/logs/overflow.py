@@ -25,10 +25,10 @@ def refuse_overflow(log: Log) -> None:
         for name, values in zip(columns, np.array([control.u for control in controls]).T, strict=True):
             for k, bits, step in overflows(values)[:1]:
                 more = -np.sign(values[k]) * 2.0**bits * step
-                told = f"{name} of {robot} at t={fixed_seconds(controls[k].t_ns)} s is {values[k]:.7g}"
-                why = f"a counter of {bits} bits, whose steps are {step:.6g} rad, ran over"
                 raise LogError(
-                    f"{log.path or log.name}: {told}: {why}, expected {values[k] + more:.6g}: add {more:.7g}"
+                    f"{log.path or log.name}: {name} of {robot} at t={fixed_seconds(controls[k].t_ns)} s is "
+                    f"{values[k]:.7g}: a counter of {bits} bits, whose steps are {step:.6g} rad, ran over, expected "
+                    f"{values[k] + more:.6g}: add {more:.7g}"
                 )
 
 

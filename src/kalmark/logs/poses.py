@@ -20,7 +20,7 @@ from kalmark.errors import LogError
 from kalmark.events import ROUNDED, fixed_seconds, unit_quaternion
 from kalmark.files import write
 from kalmark.geometry.rotations import matrix
-from kalmark.logs.log import Log, Times, Trajectory
+from kalmark.logs.log import Log, Times, Trajectory, poses_of_size
 from kalmark.logs.source import (
     Format,
     Request,
@@ -168,18 +168,10 @@ def kitti_times(path: Path) -> Times:
 
 
 # ------------------------------------------------------------------ to text
-def poses_in_space(poses: Array) -> Array:
-    """Return poses (N, 3) or (N, 7) as those of space (N, 7), at z = 0."""
-    if poses.shape[1] == len(POSE3):
-        return poses
-    flat, half = np.zeros(len(poses)), poses[:, 2] / 2
-    return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
-
-
 def tum_text(t_ns: Times, poses: Array) -> str:
     """Return a path, poses (N, 3) or (N, 7), as TUM lines: t x y z qx qy qz qw."""
     lines = ["# t_s x_m y_m z_m qx qy qz qw"]
-    for t, (x, y, z, *q) in zip(t_ns.tolist(), poses_in_space(poses).tolist(), strict=True):
+    for t, (x, y, z, *q) in zip(t_ns.tolist(), poses_of_size(poses, 7).tolist(), strict=True):
         lines.append(f"{fixed_seconds(t)} {x:.9f} {y:.9f} {z:.9f} " + " ".join(f"{value:.12f}" for value in q))
     return "\n".join(lines) + "\n"
 
@@ -191,7 +183,7 @@ def write_path(out: Path, t_ns: Times, poses: Array) -> list[Path]:
         write(out, tum_text(t_ns, poses))
         return [out]
     lines = []
-    for pose in poses_in_space(poses):
+    for pose in poses_of_size(poses, 7):
         M = np.column_stack([matrix(np.ascontiguousarray(pose[3:])), pose[:3]])
         lines.append(" ".join(f"{value:.12g}" for value in M.ravel()))
     write(times_beside(out), "".join(f"{fixed_seconds(int(t))}\n" for t in t_ns))

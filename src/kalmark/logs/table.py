@@ -123,8 +123,7 @@ class Table:
                     before = last.get(row.key)
                     if before is not None and row.t_ns < before.t_ns + strictly:
                         wanted = "increasing times" if strictly else "times that never run backwards"
-                        at = f"time {row.time} after {before.time} of {row.robot}"
-                        raise Refused(f"{at}, expected {wanted}")
+                        raise Refused(f"time {row.time} after {before.time} of {row.robot}, expected {wanted}")
                     last[row.key] = row
                 found = make(row)
             except Refused as refused:
@@ -170,8 +169,7 @@ def _of_parquet(path: Path) -> Content:
                 yield [column.to_pylist() for column in batch.columns]
         except (pyarrow.ArrowException, OSError, ValueError, UnicodeError) as error:
             reason = " ".join(str(error).split())[:160] or type(error).__name__
-            told = f"{path}: not a file of Parquet that can be read ({reason})"
-            raise LogError(f"{told}, expected a whole one") from None
+            raise LogError(f"{path}: not a file of Parquet that can be read ({reason}), expected a whole one") from None
 
     found, done = parts(), 0
     names, size = next(found)
@@ -263,8 +261,10 @@ def read_table(
     values = [name for name in header if name not in NAMES and name not in noise]
     for name in values:
         if allowed is not None and name not in required and name not in allowed:
-            wanted = f"{', '.join((*required, *allowed))}{spelling_hint(name, allowed)}"
-            raise LogError(f"{where}: column {name!r} is unknown, expected {wanted}")
+            raise LogError(
+                f"{where}: column {name!r} is unknown, expected "
+                f"{', '.join((*required, *allowed))}{spelling_hint(name, allowed)}"
+            )
     values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
     index = {name: i for i, name in enumerate(header)}
     return Table(Path(str(source)), index, tuple(values), noise, content, given, unit_ns, globe if on_globe else None)
@@ -315,8 +315,9 @@ def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
         measure = UNITS.get(closest.rpartition("_")[2])
         other = in_unit_of(name, closest)
         hint = f"; did you mean {other!r}?" if other not in ("", name, closest) else ""
-        wanted = f"{closest}{f', in {measure}' if measure else ''}{hint}"
-        raise LogError(f"{where}: column {name!r} is unknown, expected {wanted}")
+        raise LogError(
+            f"{where}: column {name!r} is unknown, expected {closest}{f', in {measure}' if measure else ''}{hint}"
+        )
 
 
 def decimal_point(text: str) -> str:
@@ -362,8 +363,9 @@ class Row:
         try:
             self.t_ns = nanoseconds_of_text(decimal_point(text) if table.content.comma else text, table.unit_ns)
         except ValueError:
-            wanted = "a finite number of seconds, within 292 years of 0"
-            raise Refused(f"{table.name('t_s')} is {short_text(text)}, expected {wanted}") from None
+            raise Refused(
+                f"{table.name('t_s')} is {short_text(text)}, expected a finite number of seconds, within 292 years of 0"
+            ) from None
         self.robot, self.sensor = intern(self.text("robot")), intern(self.text("sensor")) if with_sensor else ""
         if not self.robot or (with_sensor and not self.sensor):
             raise Refused(f"{'sensor' if self.robot else 'robot'} is empty, expected a name")
@@ -440,22 +442,26 @@ class Row:
         for name in self.table.value_columns:
             if name not in used and self.text(name):
                 who = " ".join(self.key).strip()
-                told = f"{self.table.name(name)} is {self.text(name)}"
-                raise Refused(f"{told}, expected an empty cell as in {who}'s first row")
+                raise Refused(
+                    f"{self.table.name(name)} is {self.text(name)}, expected an empty cell as in {who}'s first row"
+                )
         columns.setdefault(self.key, used)
         return values
 
-    def own_noise(self, columns: tuple[str, ...], *, definite: bool) -> Array | None:
-        """Return the covariance (m, m) that this row gives for `columns`, None if none.  Raises Refused."""
+    def measured(
+        self, columns: dict[tuple[str, str], tuple[str, ...]], *, definite: bool = True
+    ) -> tuple[list[float], Array | None]:
+        """Return this row's `values` and their own covariance (m, m), None if it gives none.  Raises Refused."""
+        y = self.values(columns)
         given = tuple(name for name in self.table.noise_columns if self.text(name))
         if not given:
-            return None
-        cov = covariance_of_cells(dict(zip(given, self.numbers(given), strict=True)), columns)
+            return y, None
+        cov = covariance_of_cells(dict(zip(given, self.numbers(given), strict=True)), columns[self.key])
         lowest = float(np.linalg.eigvalsh(cov)[0])
         if lowest < -1e-12 * float(np.abs(cov).max()) or (definite and lowest <= 0):
             wanted = "positive definite" if definite else "positive semidefinite"
             raise Refused(f"noise {cov.tolist()} has eigenvalue {lowest:.3g}, expected it {wanted}")
-        return cov
+        return y, cov
 
 
 def covariance_of_cells(given: dict[str, float], columns: tuple[str, ...]) -> Array:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.logs.log import poses_of_size
 from kalmark.logs.source import records_of
 from kalmark.report import OUTCOMES
 from kalmark.results.association_errors import association_figures, best_known, by_position, no_ids
@@ -35,7 +36,7 @@ from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_figures, repeat_notes
 from kalmark.results.restarts import restarts
 from kalmark.results.self_calibration import bias_figures, mount_figures
-from kalmark.results.truth import Truth, poses_of_size
+from kalmark.results.truth import Truth
 from kalmark.results.warnings import advice, fix_nis_per_dof, warnings, window_figures
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans

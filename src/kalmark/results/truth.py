@@ -12,7 +12,7 @@ from kalmark.arrays import Array
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
-from kalmark.logs.log import Log, PositionTrack
+from kalmark.logs.log import Log, PositionTrack, poses_of_size
 from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, padded_all, texts
 from kalmark.results.landmark_table import TAG
 from kalmark.results.measures import Rigid, pose_error
@@ -103,18 +103,6 @@ class Truth:
         fixes = {robot: PositionTrack(t_ns, xy, antenna) for robot, t_ns, xy, antenna in tracks}
         robots = tuple(named["truth_robot"].tolist())
         return cls(named["truth"], landmarks, fixes, named["truth_offset"], bool(named["truth_anchored"]), robots)
-
-
-def poses_of_size(poses: Array, size: int) -> Array:
-    """Return poses (N, 3) or (N, 7) as poses of the plane (size 3: seen from above) or of space (size 7: at z = 0)."""
-    if poses.shape[1] == size:
-        return poses
-    if size == 3:
-        x, y, z, w = poses[:, 3:].T
-        yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))  # where their x points
-        return np.column_stack([poses[:, :2], yaw])
-    flat, half = np.zeros(len(poses)), poses[:, 2] / 2
-    return np.column_stack([poses[:, :2], flat, flat, flat, np.sin(half), np.cos(half)])
 
 
 def landmarks_of_size(landmarks: Mapping[Id, Any], size: int) -> dict[Id, Array]:

@@ -21,6 +21,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import PluginError
 from kalmark.geometry.rotations import from_matrix
+from kalmark.logs.log import poses_of_size
 from kalmark.picture_options import Picture
 from kalmark.results.measures import anees_interval
 from kalmark.results.plot import BEHIND, GROUPS, VIEWS
@@ -36,7 +37,6 @@ from kalmark.results.scene import (
     sides_of,
     squares,
 )
-from kalmark.results.truth import poses_of_size
 
 INSTALL = "rerun is not installed, expected it for this view: pip install 'kalmark[view]'"
 LOOPBACK = "127.0.0.1"

@@ -13,7 +13,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import Control, Event, Fix, Frame, Raw, Scan
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, poses_of_size
 from kalmark.logs.progress import track
 from kalmark.picture_options import Picture
 from kalmark.report import Report
@@ -24,7 +24,7 @@ from kalmark.results.history import WHOLE
 from kalmark.results.measures import nees, nis, pose_error
 from kalmark.results.recording import Recording
 from kalmark.results.scene import Ray, Scene, images, images_of_report, map_shapes, picture_of, steps_of
-from kalmark.results.truth import as_rigid, poses_of_size
+from kalmark.results.truth import as_rigid
 from kalmark.viewer.rerun_stream import Stream, light_colours
 
 if TYPE_CHECKING:

@@ -130,8 +130,10 @@ def csv_of(file: Path, columns: int) -> Table | None:
         except ValueError:
             good = False
         if not good:
-            wanted = f"{columns} cells: increasing times in ns, and finite numbers"
-            raise LogError(f"{file}:{line}: {short_text(','.join(cells))}, expected {wanted}")
+            raise LogError(
+                f"{file}:{line}: {short_text(','.join(cells))}, expected {columns} cells: increasing times in ns, and "
+                "finite numbers"
+            )
         t_ns.append(t)
         numbers.append(row)
     if not t_ns:
@@ -144,8 +146,10 @@ def image_list(folder: Path) -> dict[int, Path]:
     found: dict[int, Path] = {}
     for line, cells in lines_of(folder / "data.csv"):
         if len(cells) != 2 or not cells[0].isdecimal() or (found and int(cells[0]) <= max(found)):
-            where = f"{folder / 'data.csv'}:{line}"
-            raise LogError(f"{where}: {short_text(','.join(cells))}, expected increasing times in ns, each with a file")
+            raise LogError(
+                f"{folder / 'data.csv'}:{line}: {short_text(','.join(cells))}, expected increasing times in ns, each "
+                "with a file"
+            )
         found[int(cells[0])] = folder / "data" / cells[1]
     if not found:
         raise LogError(f"{folder / 'data.csv'}:1: no rows of data, expected times and files")
