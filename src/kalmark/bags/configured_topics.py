@@ -65,8 +65,10 @@ class Asked:
         named: dict[str, str] = {}
         for name, topic in self.topics.items():
             if topic.columns and topic.robot in columns:
-                both = f"{named[topic.robot]} and {name} are both controls of {topic.robot!r}"
-                raise LogError(f"{self.bag.path}: topics {both}, expected one topic of controls for each robot")
+                raise LogError(
+                    f"{self.bag.path}: topics {named[topic.robot]} and {name} are both controls of {topic.robot!r}, "
+                    "expected one topic of controls for each robot"
+                )
             if topic.columns:
                 columns[topic.robot], named[topic.robot] = topic.columns, name
         return columns

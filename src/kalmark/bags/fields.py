@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.messages import MESSAGES, Measured, Message, Place, Pose, Seen, Twist, first_id
+from kalmark.bags.messages import MESSAGES, Measured, Message, Seen, first_id
 from kalmark.bags.topics import Scans, Topic
 from kalmark.errors import LogError
 from kalmark.events import short_text, unit_quaternion
@@ -76,19 +76,19 @@ class Fields:
         if {*POSITION[:2]} <= has:
             offers["pose"] = self.pose
         if {"lat_deg", "lon_deg"} <= has:
-            offers["globe"] = lambda m: Place(self.numbers(m, tuple(GLOBE), math.nan), None)
+            offers["globe"] = lambda m: Measured(self.numbers(m, tuple(GLOBE), math.nan))
         if has & {"v_mps", *TWIST3}:
             plane = "v_mps" in has
             names = ("v_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "w_radps") if plane else TWIST3
-            offers["twist"] = lambda m: Twist(self.numbers(m, names), None)
+            offers["twist"] = lambda m: Measured(self.numbers(m, names))
         if {"v_mps", "steering_rad"} <= has:
             offers["drive"] = partial(self.numbers, columns=("v_mps", "steering_rad"))
         if "w_radps" in has or has & {*INERTIAL[:3]}:
             turns = (*INERTIAL[:2], "w_radps" if "w_radps" in has else INERTIAL[2])
-            offers["rates"] = lambda m: Measured(self.numbers(m, turns), None)
+            offers["rates"] = lambda m: Measured(self.numbers(m, turns))
             offers["attitude"] = lambda m: None
         if has & {*INERTIAL[3:]}:
-            offers["force"] = lambda m: Measured(self.numbers(m, INERTIAL[3:]), None)
+            offers["force"] = lambda m: Measured(self.numbers(m, INERTIAL[3:]))
         return Message("fields", **offers)
 
     def table(self, m: Any) -> dict[str, list[Any]]:
@@ -121,7 +121,7 @@ class Fields:
             raise Refused(f"{len(next(iter(table.values())))} values of each field, expected one")
         return np.array([number_of_field(c, table[c][0]) * self.paths[c][1] if c in table else absent for c in columns])
 
-    def pose(self, m: Any) -> Pose:
+    def pose(self, m: Any) -> Measured:
         """Return a pose, its rotation NaN if no field is of one.  Raises Refused."""
         p, turn = self.numbers(m, POSITION), np.full(4, np.nan)
         if {*POSE3[3:]} <= self.paths.keys():
@@ -129,7 +129,7 @@ class Fields:
         elif "theta_rad" in self.paths:
             half = self.numbers(m, ("theta_rad",))[0] / 2
             turn = np.array([0.0, 0.0, math.sin(half), math.cos(half)])
-        return Pose(np.append(p, turn), None, "", "")
+        return Measured(np.append(p, turn))
 
 
 def number_of_field(column: str, v: Any) -> float:

@@ -12,7 +12,7 @@ from kalmark.bags.configured_topics import short
 from kalmark.bags.first_readings import Readings
 from kalmark.bags.first_sensors import CLUSTERS, IDS, entry_of, is_tag, section_line
 from kalmark.bags.first_start import POSE_M, start_of
-from kalmark.bags.first_words import GUESS, topic_text, yaml_mapping, yaml_text
+from kalmark.bags.first_words import GUESS, Entry, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.importer import DAY_NS
 from kalmark.bags.survey import Survey, TopicSummary, yaw
 from kalmark.bags.tf_frames import BASES
@@ -45,7 +45,7 @@ class _Lines:
 
     log: list[str] = field(default_factory=list)
     topics: list[str] = field(default_factory=list)
-    entries: dict[str, tuple[dict[str, Any], str]] = field(default_factory=dict)
+    entries: dict[str, Entry] = field(default_factory=dict)
     robots: dict[str, list[str]] = field(default_factory=dict)
     unused: list[str] = field(default_factory=list)
 
@@ -186,9 +186,9 @@ class _Writer:
         control: Any,
         kind: str,
         space: bool,
-    ) -> dict[str, tuple[dict[str, Any], str]]:
+    ) -> dict[str, Entry]:
         """Return the entries of the topics that are used, each with the reason."""
-        used: dict[str, tuple[dict[str, Any], str]] = {}
+        used: dict[str, Entry] = {}
         if isinstance(control, TopicSummary):
             slow = control.offers.pose is not None and any(scan.rate_hz > SLOW * control.rate_hz for scan in scans)
             entry: dict[str, Any] = {"type": kind} | ({"at": "scans"} if slow and "odometry" in kind else {})
@@ -251,7 +251,7 @@ class _Writer:
         return f"{topic_text(topic)}; {GUESS} these are velocities of the robot{commanded}"
 
     # -------------------------------------------------------------- fixes and truth
-    def place(self, topic: TopicSummary) -> tuple[dict[str, Any], str] | None:
+    def place(self, topic: TopicSummary) -> Entry | None:
         """Return what a topic of positions is, None if it is none or not to be used."""
         if topic.offers.globe is not None and topic.origin is not None:
             if _is_true(topic):

@@ -12,7 +12,7 @@ from kalmark.arrays import Array
 from kalmark.bags.configured_topics import sensor_name
 from kalmark.bags.first_sensors import mount_of
 from kalmark.bags.first_start import Start
-from kalmark.bags.first_words import GUESS, topic_text, yaml_mapping, yaml_text
+from kalmark.bags.first_words import GUESS, Entry, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.inertial_messages import heading_of, heading_of_field
 from kalmark.bags.messages import Measured
 from kalmark.bags.survey import Survey, TopicSummary
@@ -55,7 +55,7 @@ class Readings:
         self.heading: float | None = None  # the first that was measured, and taken
         self.tilted: dict[str, Array] = {}  # mounts by frame that gravity shows, of units that are not level
 
-    def entries(self, topics: Sequence[TopicSummary]) -> dict[str, tuple[dict[str, Any], str]]:
+    def entries(self, topics: Sequence[TopicSummary]) -> dict[str, Entry]:
         """Return the entries of the topics that are used, each with the reason."""
         used = {}
         for topic in sorted(topics, key=lambda each: each.offers.rates is None):  # compasses last

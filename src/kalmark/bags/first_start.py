@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.bags.first_words import GUESS
+from kalmark.bags.first_words import GUESS, Entry
 from kalmark.bags.survey import Poses, Survey, TopicSummary, yaw
 from kalmark.logs.geodesy import to_tangent_plane
+from kalmark.logs.log import poses_of_size
+from kalmark.results.measures import rigid
 
 NEAR_NS = 500_000_000
 LEAST_WAY_M = 2.0
@@ -32,7 +34,7 @@ class Start:
     known: bool = True
 
 
-def start_of(found: Survey, control: Any, used: Mapping[str, tuple[dict[str, Any], str]], space: bool) -> Start | None:
+def start_of(found: Survey, control: Any, used: Mapping[str, Entry], space: bool) -> Start | None:
     """Return a robot's start in the frame of its fixes, None if nothing or a true path in that frame determines it."""
     if control is None or space:
         return None
@@ -68,10 +70,7 @@ def align_odometry(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], l
     p, q = frames[after[near], :2], enu[near]
     if len(p) < 3 or np.ptp(p, axis=0).max() < LEAST_WAY_M:
         return None
-    a, b = p - p.mean(axis=0), q - q.mean(axis=0)
-    turn = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-    R = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    spread = math.sqrt(float(np.mean((b - a @ R.T) ** 2))) + 0.05
-    start = R @ (frames[0, :2] - p.mean(axis=0)) + q.mean(axis=0)
-    heading = math.remainder(yaw(frames[0]) + turn, 2 * math.pi)
-    return [float(start[0]), float(start[1]), heading], [spread, max(spread / float(np.linalg.norm(a)), 0.05)]
+    fit, (begin,) = rigid(p, q), poses_of_size(frames[:1], 3)
+    x, y, heading = fit.poses(begin[None])[0].tolist()
+    spread, reach = math.sqrt(float(np.mean((q - fit(p)) ** 2))) + 0.05, float(np.linalg.norm(p - p.mean(axis=0)))
+    return [x, y, math.remainder(heading, 2 * math.pi)], [spread, max(spread / reach, 0.05)]

@@ -9,6 +9,8 @@ from kalmark.bags.configured_topics import short
 from kalmark.bags.survey import TopicSummary
 
 GUESS = "GUESS:"
+Entry = tuple[dict[str, Any], str]
+"""The entry of a topic in a configuration, and the reason for it."""
 
 
 def yaml_text(text: str) -> str:

@@ -17,13 +17,11 @@ from kalmark.bags.configured_topics import Asked, sensor_name, short
 from kalmark.bags.messages import (
     MESSAGES,
     NO_ROTATION,
-    Message,
-    Place,
-    Pose,
+    Measured,
     Seen,
 )
 from kalmark.bags.opening import Bag, Received, find_bag, has_header, header_time, refuse_undeclared_fields
-from kalmark.bags.state_topics import Gathered, OwnReadings
+from kalmark.bags.state_topics import Gathered, Incoming, OwnReadings
 from kalmark.bags.tf_mounts import Mounts
 from kalmark.bags.topics import (
     Fixes,
@@ -47,7 +45,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.geodesy import fault, to_tangent_plane
 from kalmark.logs.image_files import Forward
-from kalmark.logs.log import Log, PositionTrack, Trajectory
+from kalmark.logs.log import Log, PositionTrack, Trajectory, poses_of_size
 from kalmark.logs.source import Format, Request
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import BEAM, POSE3, POSITION
@@ -76,8 +74,10 @@ def read(
             return tables.read(bag, request)
         if not topics:
             there = ", ".join(bag.topics) or "none"
-            hint = f"topics {there}; `kalmark bag {path} --out config.yaml` writes a configuration to start from"
-            raise LogError(f"{path}: log.topics is missing, expected what they are: {hint}")
+            raise LogError(
+                f"{path}: log.topics is missing, expected what they are: topics {there}; `kalmark bag {path} --out "
+                "config.yaml` writes a configuration to start from"
+            )
         asked = Asked(bag, {name: topic_of(name, section) for name, section in topics.items()})
         return _Importer(asked, request).log()
 
@@ -107,7 +107,7 @@ class _Importer:
         self.calibrate()
         for received in self.bag.messages({*self.named.values()}):
             for name in self.asked.entries(received):
-                self.take(received._replace(topic=name))
+                self.take(name, received)
         self.interpolated()
         self.own.averaged(self.bag.path)
         for (name, reason), count in sorted(self.out.left_out.items()):
@@ -138,53 +138,54 @@ class _Importer:
             robots.setdefault(robot, {}).setdefault("sensors", {}).setdefault(sensor, {})["mount"] = mount
         return {"robots": robots} if robots else {}
 
-    def take(self, received: Received) -> None:
-        """Take one message; what is bad in it is refused, with its topic and time."""
-        topic, offer = self.topics[received.topic], self.asked.offers[received.topic]
-        self.received[received.topic] += 1
-        t_ns = self.time(received, topic)
+    def take(self, name: str, received: Received) -> None:
+        """Take one message of a topic; what is bad in it is refused, with its topic and time."""
+        self.received[name] += 1
+        t_ns = self.time(name, received)
         if t_ns is None:
-            self.out.left_out[received.topic, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
+            self.out.left_out[name, "messages with a time of 0; `time: recorded` takes the recorder's"] += 1
             return
         try:
             with refuse_undeclared_fields():
-                self.taken(received, topic, offer, t_ns)
+                self.taken(Incoming(name, self.topics[name], self.asked.offers[name], received.message, t_ns))
         except (Refused, EventError) as refused:
-            at = f"{received.topic} at t={fixed_seconds(t_ns)} s"
-            self.request.refuse(f"{self.bag.path}: {at}: {refused}")
+            self.request.refuse(f"{self.bag.path}: {name} at t={fixed_seconds(t_ns)} s: {refused}")
 
-    def taken(self, received: Received, topic: Topic, offer: Message, t_ns: int) -> None:
+    def taken(self, m: Incoming) -> None:
         """Take the parts of a message that its topic is configured for.  Raises Refused and EventError."""
+        topic, offer = m.topic, m.offer
         if isinstance(topic, Scans):
-            self.scan(received, topic, offer, t_ns)
+            self.scan(m, topic)
         elif isinstance(topic, Images):
-            self.image(received, topic, t_ns)
+            self.image(m, topic)
         elif isinstance(topic, InertialTopic):
-            self.own.inertial(received, topic, offer, t_ns)
+            self.own.inertial(m)
         elif isinstance(topic, Sparse):
-            self.own.take(received, topic, offer, t_ns)
-        elif isinstance(topic, Fixes | Truths) and offer.globe is not None:
-            self.globe(received, topic, offer.globe(received.message), t_ns)
+            self.own.take(m, topic)
+        elif isinstance(topic, Placed) and offer.globe is not None:
+            self.globe(m, topic, offer.globe(m.message))
         elif isinstance(topic, Posed):
-            self.poses(received, topic, offer, t_ns)
+            self.poses(m, topic)
         elif offer.drive is not None and "drive" in topic.needs:
-            self.control(topic, t_ns, offer.drive(received.message), None)
-        elif offer.twist is not None:
-            self.velocity(topic, t_ns, offer, received.message)
+            self.control(m, offer.drive(m.message), None)
+        elif offer.twist is not None:  # a velocity, held from now on
+            own = [0, 1, 2, 3, 4, 5] if topic.space else [0, 5]
+            self.control(m, offer.twist(m.message).v[own], own_noise(m, own))
 
-    def time(self, received: Received, topic: Topic) -> int | None:
+    def time(self, name: str, received: Received) -> int | None:
         """Return the time (ns) of a message, None if its header has 0, which is no time.
 
         Raises LogError if headers and the recorder have different clocks.
         """
+        topic = self.topics[name]
         own = has_header(received.message) and topic.time != "recorded"
         if own and topic.time == "auto" and header_time(received.message) == 0:
             return None
         if topic.time == "header" and not own:
-            what = f"topic {received.topic}: messages of the type {short(received.type)} have no header"
+            what = f"topic {name}: messages of the type {short(received.type)} have no header"
             raise LogError(f"{self.bag.path}: {what}, expected `time: recorded`")
         t_ns = header_time(received.message) if own else received.recorded_ns
-        first = self.clocks.setdefault(own, (received.topic, t_ns))
+        first = self.clocks.setdefault(own, (name, t_ns))
         other = self.clocks.get(not own)
         if other is not None and abs(first[1] - other[1]) > DAY_NS:
             (a, t_a), (b, t_b) = self.clocks[True], self.clocks[False]
@@ -192,60 +193,50 @@ class _Importer:
             raise LogError(f"{self.bag.path}: {what}, expected one clock: `time: recorded` for both")
         return t_ns + round(topic.shift_s * 1e9)
 
-    def poses(self, received: Received, topic: Posed, offer: Message, t_ns: int) -> None:
+    def poses(self, m: Incoming, topic: Posed) -> None:
         """Take the pose in a message, or those of its frames that the topic asks for, each at its own time."""
-        if offer.transforms is not None:
+        if m.offer.transforms is not None:
             wanted = ((topic.frame or "").lstrip("/"), (topic.child_frame or "").lstrip("/"))
             shift = round(topic.shift_s * 1e9)
-            for each in offer.transforms(received.message):
+            for each in m.offer.transforms(m.message):
                 if (each.parent, each.child) == wanted:
-                    at = t_ns if topic.time == "recorded" else each.t_ns + shift
-                    self.pose(received, topic, offer, Pose(each.frame, None, *wanted), at)
-        elif offer.pose is not None:
-            self.pose(received, topic, offer, offer.pose(received.message), t_ns)
+                    at = m if topic.time == "recorded" else m._replace(t_ns=each.t_ns + shift)
+                    self.pose(at, Measured(each.frame))
+        elif m.offer.pose is not None:
+            self.pose(m, m.offer.pose(m.message))
 
-    def pose(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
+    def pose(self, m: Incoming, pose: Measured) -> None:
         """Take one pose: of odometry, as a fix or as truth."""
-        if not np.isfinite(pose.frame[:3]).all():
-            raise Refused(f"pose {pose.frame.tolist()}, expected finite numbers")
-        if np.isnan(pose.frame[3:]).any() and not isinstance(topic, Fixes):
+        if not np.isfinite(pose.v[:3]).all():
+            raise Refused(f"pose {pose.v.tolist()}, expected finite numbers")
+        if np.isnan(pose.v[3:]).any() and not isinstance(m.topic, Fixes):
             raise Refused(NO_ROTATION)
-        if isinstance(topic, Fixes):
-            self.fix(topic, t_ns, pose.frame[:3], None if pose.cov is None else pose.cov[:3, :3])
-        elif isinstance(topic, Truths):
-            own = pose.frame if self.in_space(topic.robot) else pose_in_plane(pose.frame)
-            self.kept(self.paths, received, topic.robot, t_ns, own)
+        if isinstance(m.topic, Fixes):
+            self.fix(m, m.topic, pose.v[:3], None if pose.cov is None else pose.cov[:3, :3])
+        elif isinstance(m.topic, Truths):
+            size = 7 if self.in_space(m.topic.robot) else 3
+            self.kept(self.paths, m, poses_of_size(pose.v[None], size)[0])
         else:
-            self.add_odometry_pose(received, topic, offer, pose, t_ns)
+            self.add_odometry_pose(m, pose.v)
 
-    def add_odometry_pose(self, received: Received, topic: Posed, offer: Message, pose: Pose, t_ns: int) -> None:
-        """Take a pose of odometry: the increment from the one before it."""
-        before = self.last.get(received.topic)
-        if not self.out.is_next(received, before and before[0], t_ns, "poses"):
+    def add_odometry_pose(self, m: Incoming, frame: Array) -> None:
+        """Take a pose (7,) of odometry: the increment from the one before it."""
+        topic, before = m.topic, self.last.get(m.name)
+        if not self.out.is_next(m, before and before[0], "poses"):
             return
-        self.last[received.topic] = (t_ns, pose.frame)
+        self.last[m.name] = (m.t_ns, frame)
         if isinstance(topic, Moved) and topic.at == "scans":
-            self.ways.setdefault(received.topic, {})[t_ns] = pose.frame
+            self.ways.setdefault(m.name, {})[m.t_ns] = frame
             return
         if before is None:
             return
-        rows = [0, 1, 2, 3, 4, 5] if topic.space else [0, 1, 5]
-        cov, dt_s = self.own_noise(topic, offer, received.message, rows), (t_ns - before[0]) * 1e-9
-        self.control(topic, t_ns, self.step(topic, before[1], pose.frame), None if cov is None else cov * dt_s**2)
-
-    def own_noise(self, topic: Topic, offer: Message, message: Any, rows: list[int]) -> Array | None:
-        """Return the covariance of some numbers of a message's twist, if controls take it.  Raises Refused."""
-        if not isinstance(topic, Noisy) or not topic.own_noise:
-            return None
-        cov = None if offer.twist is None else offer.twist(message).cov
-        if cov is None:
-            raise Refused("the message has no covariance, expected one for `own_noise`")
-        return cov[np.ix_(rows, rows)]
+        cov, dt_s = own_noise(m, [0, 1, 2, 3, 4, 5] if topic.space else [0, 1, 5]), (m.t_ns - before[0]) * 1e-9
+        self.control(m, self.step(topic, before[1], frame), None if cov is None else cov * dt_s**2)
 
     def step(self, topic: Topic, a: Array, b: Array) -> Array:
         """Return the control that leads from the pose a (7,) to b: an increment of the plane or of space."""
         if not self.in_space(topic.robot):
-            return relative_pose(pose_in_plane(a), pose_in_plane(b))
+            return relative_pose(*poses_of_size(np.array([a, b]), 3))
         step = compose(inverse(a)[0], b)[0]
         return np.append(step[:3], rotations.log(step[3:]))
 
@@ -262,39 +253,33 @@ class _Importer:
                 self.out.left_out[name, "scans and fixes outside the odometry"] += every - len(self.out.events)
             t_ns = sorted({event.t_ns for event in self.out.events if event.robot == topic.robot})
             for t, (a, b) in zip(t_ns[1:], pairwise(path.at(t_ns, max_gap_s=FOREVER_S)), strict=True):
-                self.control(topic, t, self.step(topic, a, b), None)
+                self.out.events.append(Control(t_ns=t, robot=topic.robot, u=self.step(topic, a, b)))
 
-    def velocity(self, topic: Topic, t_ns: int, offer: Message, message: Any) -> None:
-        """Take a velocity, held from now on."""
-        own = [0, 1, 2, 3, 4, 5] if topic.space else [0, 5]
-        noise = self.own_noise(topic, offer, message, own)
-        self.control(topic, t_ns, offer.twist(message).v[own], noise)  # type: ignore[misc]
-
-    def control(self, topic: Topic, t_ns: int, u: Array, cov: Array | None) -> None:
+    def control(self, m: Incoming, u: Array, cov: Array | None) -> None:
         """Take a control."""
         if cov is not None:
             if not np.isfinite(cov).all():
                 raise Refused(f"noise {cov.tolist()}, expected finite numbers")
             if np.linalg.eigvalsh(cov)[0] < -1e-12 * np.abs(cov).max(initial=0.0):
                 raise Refused(f"noise {cov.tolist()}, expected it positive semidefinite")
-        self.out.events.append(Control(t_ns=t_ns, robot=topic.robot, u=u, cov=cov))
+        self.out.events.append(Control(t_ns=m.t_ns, robot=m.topic.robot, u=u, cov=cov))
 
-    def globe(self, received: Received, topic: Placed, place: Place | None, t_ns: int) -> None:
+    def globe(self, m: Incoming, topic: Placed, place: Measured | None) -> None:
         """Take a position on the globe: as a fix, or to score only."""
         if place is None:
-            self.out.left_out[received.topic, "messages without a fix"] += 1
+            self.out.left_out[m.name, "messages without a fix"] += 1
             return
-        if wrong := fault(place.lla):
+        if wrong := fault(place.v):
             raise Refused(wrong)
-        lla = np.where(np.isfinite(place.lla), place.lla, 0.0)  # a fix in two dimensions has no height
+        lla = np.where(np.isfinite(place.v), place.v, 0.0)  # a fix in two dimensions has no height
         origin = self.origins.setdefault("", lla if topic.origin is None else np.array(topic.origin, dtype=np.float64))
         enu = to_tangent_plane(lla, origin)
         if isinstance(topic, Fixes):
-            self.fix(topic, t_ns, enu, place.cov)
+            self.fix(m, topic, enu, place.cov)
         else:
-            self.kept(self.positions, received, topic.robot, t_ns, enu[:2])
+            self.kept(self.positions, m, enu[:2])
 
-    def fix(self, topic: Fixes, t_ns: int, p: Array, cov: Array | None) -> None:
+    def fix(self, m: Incoming, topic: Fixes, p: Array, cov: Array | None) -> None:
         """Take a position as a fix, with the noise of the topic or else its own."""
         own = _AXES3 if self.in_space(topic.robot) else _AXES2
         N = None if cov is None else cov[np.ix_(own, own)]
@@ -303,35 +288,33 @@ class _Importer:
         if N is None or not np.isfinite(N).all() or np.linalg.eigvalsh(N)[0] <= 0:
             told = "no covariance" if N is None else f"the covariance {N.tolist()}"
             raise Refused(f"the position has {told}, expected a positive definite one, or sigma_m of the topic")
-        self.out.events.append(Fix(t_ns=t_ns, robot=topic.robot, y=p[own], cov=N))
+        self.out.events.append(Fix(t_ns=m.t_ns, robot=topic.robot, y=p[own], cov=N))
 
-    def kept(self, table: dict[str, dict[int, Array]], received: Received, robot: str, t_ns: int, value: Array) -> None:
+    def kept(self, table: dict[str, dict[int, Array]], m: Incoming, value: Array) -> None:
         """Keep a true pose or position; times must increase."""
-        mine = table.setdefault(robot, {})
-        if self.out.is_next(received, next(reversed(mine), None), t_ns, "poses"):
-            mine[t_ns] = value
+        mine = table.setdefault(m.topic.robot, {})
+        if self.out.is_next(m, next(reversed(mine), None), "poses"):
+            mine[m.t_ns] = value
 
-    def scan(self, received: Received, topic: Scans, offer: Message, t_ns: int) -> None:
+    def scan(self, m: Incoming, topic: Scans) -> None:
         """Take what a sensor saw."""
-        seen = offer.seen(received.message, topic)  # type: ignore[misc]
-        seen = seen.without([topic.ignores(id_, t_ns) for id_ in seen.ids])
+        seen = m.offer.seen(m.message, topic)  # type: ignore[misc]
+        seen = seen.without([topic.ignores(id_, m.t_ns) for id_ in seen.ids])
         for reason, count in seen.left_out.items():
-            self.out.left_out[received.topic, reason] += count
-        columns, y = self.chosen(received.topic, topic, seen)
-        sensor = sensor_name(received.topic, topic)
+            self.out.left_out[m.name, reason] += count
+        columns, y = self.chosen(m.name, topic, seen)
+        sensor = sensor_name(m.name, topic)
         known = self.out.sensor_columns.setdefault((topic.robot, sensor), columns)
         if known != columns and len(y):
             raise Refused(f"columns {', '.join(columns)}, expected {', '.join(known)} as in its first message")
-        ids = seen.ids if seen.ids else None
-        self.out.events.append(Scan(t_ns=t_ns, robot=topic.robot, sensor=sensor, y=y, ids=ids))
+        self.out.events.append(Scan(t_ns=m.t_ns, robot=topic.robot, sensor=sensor, y=y, ids=seen.ids or None))
 
-    def image(self, received: Received, topic: Images, t_ns: int) -> None:
+    def image(self, m: Incoming, topic: Images) -> None:
         """Take an image, whose pixels are read from the bag when they are needed."""
-        name = received.topic
-        if name not in self.images:
-            self.images[name] = Forward(partial(images_of, self.bag.path, self.named[name]))
-        read, sensor = partial(self.images[name].at, self.received[name] - 1), sensor_name(name, topic)
-        self.out.events.append(Frame(t_ns=t_ns, robot=topic.robot, sensor=sensor, image=read))
+        if m.name not in self.images:
+            self.images[m.name] = Forward(partial(images_of, self.bag.path, self.named[m.name]))
+        read, sensor = partial(self.images[m.name].at, self.received[m.name] - 1), sensor_name(m.name, topic)
+        self.out.events.append(Frame(t_ns=m.t_ns, robot=topic.robot, sensor=sensor, image=read))
 
     def calibrate(self) -> None:
         """Take the calibrations of the cameras whose images are taken.  Raises LogError."""
@@ -372,6 +355,16 @@ class _Importer:
         return wanted, turned_at_all(wanted, np.column_stack([given[column] for column in wanted]))
 
 
+def own_noise(m: Incoming, rows: list[int]) -> Array | None:
+    """Return the covariance of some numbers of a message's twist, if controls take it.  Raises Refused."""
+    if not isinstance(m.topic, Noisy) or not m.topic.own_noise:
+        return None
+    cov = None if m.offer.twist is None else m.offer.twist(m.message).cov
+    if cov is None:
+        raise Refused("the message has no covariance, expected one for `own_noise`")
+    return cov[np.ix_(rows, rows)]
+
+
 def turned_at_all(columns: tuple[str, ...], y: Array) -> Array:
     """Return observations (K, m) whose rotations, if they are taken, are there.  Raises Refused."""
     if np.isnan(y[:, [column in POSE3[3:] for column in columns]]).any():
@@ -405,12 +398,6 @@ def images_of(path: Path, name: str) -> Iterator[Any]:
                 yield decode(received.message)
             except OSError as error:
                 yield error
-
-
-def pose_in_plane(frame: Array) -> Array:
-    """Return x, y and yaw (3,) of a frame (7,)."""
-    x, y, z, w = frame[3:]
-    return np.array([frame[0], frame[1], np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))])
 
 
 def relative_pose(a: Array, b: Array) -> Array:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from kalmark.bags.opening import SECOND_NS
 from kalmark.errors import LogError
 
 RECORD = "kalmark_msgs/msg/Record"
@@ -20,7 +21,6 @@ string[] ids
 float64[] values
 float64[] covariance
 """
-SECOND_NS = 1_000_000_000
 LATEST_S = 2**31 - 1  # a header's seconds are int32
 
 

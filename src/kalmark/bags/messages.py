@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.bags.opening import header_time
 from kalmark.bags.topics import Scans
 from kalmark.events import unit_quaternion
 from kalmark.logs.camera_calibration import lens
@@ -31,34 +32,11 @@ DELETED = 2  # of Marker.action: this and what is above removes markers
 TYPES_OF_A_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
 
 
-class Pose(NamedTuple):
-    """A pose (7,) of the frame `child` in the frame `parent`, its covariance (6, 6) if the message has one."""
-
-    frame: Array
-    cov: Array | None
-    parent: str
-    child: str
-
-
-class Twist(NamedTuple):
-    """Velocity (6,): m/s and rad/s along and about x, y, z of the robot, its covariance (6, 6) if it has one."""
-
-    v: Array
-    cov: Array | None
-
-
 class Measured(NamedTuple):
-    """Numbers that an inertial unit measured in its own frame, with their covariance (3, 3), None if it is unknown."""
+    """Numbers of a message, with their covariance, None if it is unknown."""
 
     v: Array
-    cov: Array | None
-
-
-class Place(NamedTuple):
-    """Latitude, longitude (deg) and height (m), with the covariance (3, 3) of east, north, up if it is known."""
-
-    lla: Array
-    cov: Array | None
+    cov: Array | None = None
 
 
 @dataclass
@@ -87,6 +65,10 @@ class Seen:
         return Seen(self.columns, [y for y, _ in rows], [id_ for _, id_ in rows], left_out)
 
 
+Reads = Callable[[Any], Measured | None] | None
+"""Reads a measurement of an inertial unit or a compass from a message, None where it has none."""
+
+
 class Transform(NamedTuple):
     """The frame `child` (7,) in the frame `parent`, at a time (ns)."""
 
@@ -98,19 +80,24 @@ class Transform(NamedTuple):
 
 @dataclass(frozen=True)
 class Message:
-    """Contents that can be read from messages of one type."""
+    """Contents that can be read from messages of one type, None of what they do not have.
+
+    `pose` (7,) with a covariance (6, 6); `twist` (6,), m/s and rad/s along and about x, y, z of the robot, likewise;
+    `globe` (3,), latitude, longitude (deg) and height (m), with the covariance of east, north, up; the measurements of
+    an inertial unit or a compass in its own frame (3,), an orientation (4,).
+    """
 
     what: str
-    pose: Callable[[Any], Pose] | None = None
+    pose: Callable[[Any], Measured] | None = None
     noisy: bool = False
-    twist: Callable[[Any], Twist] | None = None
+    twist: Callable[[Any], Measured] | None = None
     drive: Callable[[Any], Array] | None = None
-    globe: Callable[[Any], Place | None] | None = None
+    globe: Reads = None
     seen: Callable[[Any, Scans], Seen] | None = None
-    rates: Callable[[Any], Measured | None] | None = None
-    attitude: Callable[[Any], Measured | None] | None = None
-    force: Callable[[Any], Measured | None] | None = None
-    field: Callable[[Any], Measured | None] | None = None
+    rates: Reads = None
+    attitude: Reads = None
+    force: Reads = None
+    field: Reads = None
     transforms: Callable[[Any], list[Transform]] | None = None
     camera: Callable[[Any], dict[str, Any]] | None = None
     image: Callable[[Any], Any] | None = None
@@ -146,25 +133,24 @@ def covariance_of_values(values: Any, size: int = 6) -> Array:
     return np.array(values, dtype=np.float64).reshape(size, size)
 
 
-def odometry_pose(m: Any) -> Pose:
-    """Return the pose of a nav_msgs/Odometry."""
-    return Pose(pose_frame(m.pose.pose), covariance_of_values(m.pose.covariance), m.header.frame_id, m.child_frame_id)
+def pose(m: Any) -> Measured:
+    """Return the pose of a geometry_msgs/PoseStamped."""
+    return Measured(pose_frame(m.pose))
 
 
-def stamped_pose(m: Any) -> Pose:
-    """Return that of a geometry_msgs/PoseStamped."""
-    return Pose(pose_frame(m.pose), None, m.header.frame_id, "")
+def uncertain_pose(m: Any) -> Measured:
+    """Return the pose of a nav_msgs/Odometry or a geometry_msgs/PoseWithCovarianceStamped."""
+    return Measured(pose_frame(m.pose.pose), covariance_of_values(m.pose.covariance))
 
 
-def stamped_pose_with_covariance(m: Any) -> Pose:
-    """Return that of a geometry_msgs/PoseWithCovarianceStamped."""
-    return Pose(pose_frame(m.pose.pose), covariance_of_values(m.pose.covariance), m.header.frame_id, "")
-
-
-def velocity(twist: Any, cov: Any = None) -> Twist:
+def velocity(twist: Any) -> Measured:
     """Return a geometry_msgs/Twist."""
-    v = np.array([getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"])
-    return Twist(v, None if cov is None else covariance_of_values(cov))
+    return Measured(np.array([getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]))
+
+
+def uncertain_velocity(m: Any) -> Measured:
+    """Return the velocity of a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped."""
+    return Measured(velocity(m.twist.twist).v, covariance_of_values(m.twist.covariance))
 
 
 def drive(m: Any) -> Array:
@@ -172,12 +158,12 @@ def drive(m: Any) -> Array:
     return np.array([m.speed, m.steering_angle], dtype=np.float64)
 
 
-def satellite_fix(m: Any) -> Place | None:
+def satellite_fix(m: Any) -> Measured | None:
     """Return the position of a sensor_msgs/NavSatFix, None where the receiver has none."""
     if m.status.status < NO_FIX:
         return None
     cov = covariance_of_values(m.position_covariance, 3) if m.position_covariance_type != UNKNOWN_COVARIANCE else None
-    return Place(np.array([m.latitude, m.longitude, m.altitude]), cov)
+    return Measured(np.array([m.latitude, m.longitude, m.altitude]), cov)
 
 
 def vector(v: Any, cov: Any) -> Measured | None:
@@ -207,9 +193,8 @@ def transforms(m: Any) -> list[Transform]:
 
 def transform(m: Any) -> Transform:
     """Return a geometry_msgs/TransformStamped."""
-    t_ns = int(m.header.stamp.sec) * 1_000_000_000 + int(m.header.stamp.nanosec)
     frame = frame_of(m.transform.translation, m.transform.rotation)
-    return Transform(t_ns, m.header.frame_id.lstrip("/"), m.child_frame_id.lstrip("/"), frame)
+    return Transform(header_time(m), m.header.frame_id.lstrip("/"), m.child_frame_id.lstrip("/"), frame)
 
 
 def camera(m: Any) -> dict[str, Any]:
@@ -411,15 +396,12 @@ def listed_poses(m: Any, scan: Scans) -> Seen:
 
 # ------------------------------------------------------------------ the table
 MESSAGES: dict[str, Message] = {
-    "nav_msgs/msg/Odometry": Message("odometry", pose=odometry_pose,
-                                     twist=lambda m: velocity(m.twist.twist, m.twist.covariance)),
-    "geometry_msgs/msg/PoseStamped": Message("pose", pose=stamped_pose),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": Message("pose", pose=stamped_pose_with_covariance,
-                                                             noisy=True),
+    "nav_msgs/msg/Odometry": Message("odometry", pose=uncertain_pose, twist=uncertain_velocity),
+    "geometry_msgs/msg/PoseStamped": Message("pose", pose=pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": Message("pose", pose=uncertain_pose, noisy=True),
     "geometry_msgs/msg/Twist": Message("velocity", twist=velocity),
     "geometry_msgs/msg/TwistStamped": Message("velocity", twist=lambda m: velocity(m.twist)),
-    "geometry_msgs/msg/TwistWithCovarianceStamped": Message(
-        "velocity", twist=lambda m: velocity(m.twist.twist, m.twist.covariance)),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": Message("velocity", twist=uncertain_velocity),
     "ackermann_msgs/msg/AckermannDrive": Message("speed and steering", drive=drive),
     "ackermann_msgs/msg/AckermannDriveStamped": Message("speed and steering", drive=lambda m: drive(m.drive)),
     "sensor_msgs/msg/NavSatFix": Message("satellite fix", globe=satellite_fix),

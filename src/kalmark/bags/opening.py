@@ -75,8 +75,7 @@ class Bag:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError:
-            hint = "`pip install 'kalmark[rosbags]'`"
-            raise LogError(f"{self.path}: a bag needs the library rosbags, {hint}") from None
+            raise LogError(f"{self.path}: a bag needs the library rosbags, `pip install 'kalmark[rosbags]'`") from None
         with ExitStack() as stack:
             path = self._unpacked(stack)
             try:
@@ -161,11 +160,15 @@ class Bag:
                 message = self._reader.deserialize(raw, connection.msgtype)
             except Exception as error:
                 if connection.msgtype not in self._reader.typestore.fielddefs:
-                    what = f"messages of the type {connection.msgtype}, {UNDEFINED}"
-                    raise LogError(f"{self.path}: topic {connection.topic} has {what}") from None
+                    raise LogError(
+                        f"{self.path}: topic {connection.topic} has messages of the type {connection.msgtype}, "
+                        f"{UNDEFINED}"
+                    ) from None
                 reason = " ".join(str(error).split())[:120] or type(error).__name__
-                at = f"the message of {connection.topic} recorded at {recorded_ns} ns"
-                raise LogError(f"{self.path}: {at} is no {connection.msgtype} ({reason})") from None
+                raise LogError(
+                    f"{self.path}: the message of {connection.topic} recorded at {recorded_ns} ns is no "
+                    f"{connection.msgtype} ({reason})"
+                ) from None
             yield Received(connection.topic, connection.msgtype, int(recorded_ns), message)
 
     def _raw(self, connections: list[Any]) -> Iterator[tuple[Any, int, bytes]]:

@@ -5,19 +5,28 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.bags.inertial_messages import GRAVITY, GYRO, HEADING, INCLINATION, heading_of, heading_of_field, means
-from kalmark.bags.messages import Measured, Message
-from kalmark.bags.opening import Received
-from kalmark.bags.topics import Compass, Imu, InertialTopic, Sparse
+from kalmark.bags.messages import Message, Reads
+from kalmark.bags.topics import Compass, Imu, Sparse, Topic
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, fixed_seconds
 from kalmark.geometry import rotations
 from kalmark.logs.table import Refused
+
+
+class Incoming(NamedTuple):
+    """One message at its time, by the name of the entry of the configuration that asks for it."""
+
+    name: str
+    topic: Topic
+    offer: Message
+    message: Any
+    t_ns: int
 
 
 @dataclass
@@ -28,13 +37,13 @@ class Gathered:
     sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
 
-    def is_next(self, received: Received, before_ns: int | None, t_ns: int, what: str) -> bool:
+    def is_next(self, m: Incoming, before_ns: int | None, what: str) -> bool:
         """Return whether a time follows the one before; one that is the same is counted.  Raises Refused."""
-        if before_ns is None or t_ns > before_ns:
+        if before_ns is None or m.t_ns > before_ns:
             return True
-        if t_ns < before_ns:
+        if m.t_ns < before_ns:
             raise Refused(f"time after {fixed_seconds(before_ns)} s, expected times that never run backwards")
-        self.left_out[received.topic, f"{what} at the time of the one before"] += 1
+        self.left_out[m.name, f"{what} at the time of the one before"] += 1
         return False
 
 
@@ -49,50 +58,52 @@ class OwnReadings:
         self.rates: dict[tuple[str, str], dict[int, Array]] = {}
         self.read_ns: dict[tuple[str, str], int] = {}
 
-    def take(self, received: Received, topic: Sparse, offer: Message, t_ns: int) -> None:
+    def take(self, m: Incoming, topic: Sparse) -> None:
         """Take what an inertial unit or a compass measured of its robot, of what is sparse only now and then."""
-        for sensor, columns, y in self.said(received, topic, offer):
+        for sensor, columns, y in self.said(m, topic):
             key, often = (topic.robot, sensor), columns in GYRO.values()
             if often and isinstance(topic, Imu) and topic.at == "controls":
-                self.rates.setdefault(key, {})[t_ns] = y
-            elif often or key not in self.read_ns or t_ns - self.read_ns[key] >= topic.every_s * 1e9:
-                self.reading(received, *key, t_ns, columns, y)
+                self.rates.setdefault(key, {})[m.t_ns] = y
+            elif often or key not in self.read_ns or m.t_ns - self.read_ns[key] >= topic.every_s * 1e9:
+                self.reading(m, sensor, columns, y)
 
-    def said(self, received: Received, topic: Sparse, offer: Any) -> Iterator[tuple[str, tuple[str, ...], Any]]:
+    def said(self, m: Incoming, topic: Sparse) -> Iterator[tuple[str, tuple[str, ...], Any]]:
         """Yield the readings of a message, in the plane made level: sensor, columns and numbers."""
-        m, R = received.message, self.level.get(received.topic, (np.eye(3), False))[0]
-        if isinstance(topic, Compass) and (b := self.measured(received, "field", offer.field(m))) is not None:
+        R = self.level.get(m.name, (np.eye(3), False))[0]
+        if isinstance(topic, Compass) and (b := self.measured(m, "field", m.offer.field)) is not None:
             heading = heading_of_field(R @ b)
             if heading is None:
-                self.out.left_out[received.topic, "fields that are steep"] += 1
+                self.out.left_out[m.name, "fields that are steep"] += 1
             else:
-                yield topic.sensors(received.topic)[0], HEADING, [heading]
+                yield topic.sensors(m.name)[0], HEADING, [heading]
         if not isinstance(topic, Imu):
             return
-        if topic.gyro and (w := self.measured(received, "rates", offer.rates(m))) is not None:
+        if topic.gyro and (w := self.measured(m, "rates", m.offer.rates)) is not None:
             space = self.in_space(topic.robot)
             yield topic.gyro, GYRO[space], w if space else (R @ w)[2:]
-        q = self.measured(received, "an orientation", offer.attitude(m)) if topic.heading or topic.inclination else None
+        q = self.measured(m, "an orientation", m.offer.attitude) if topic.heading or topic.inclination else None
         if topic.heading and q is not None:
             yield topic.heading, HEADING, [heading_of(q, R)]
         if topic.inclination and q is not None:
             yield topic.inclination, INCLINATION, rotations.to_euler(np.ascontiguousarray(q))[0][:2]
-        if topic.gravity and (a := self.measured(received, "accelerations", offer.force(m))) is not None:
+        if topic.gravity and (a := self.measured(m, "accelerations", m.offer.force)) is not None:
             yield topic.gravity, GRAVITY, a
 
-    def measured(self, received: Received, what: str, told: Measured | None) -> Array | None:
-        """Return the measurement in a message; without one count it and return None."""
-        if told is None:
-            self.out.left_out[received.topic, f"messages without {what}"] += 1
+    def measured(self, m: Incoming, what: str, read: Reads) -> Array | None:
+        """Return the measurement that is read from a message; without one count it and return None."""
+        found = None if read is None else read(m.message)
+        if found is None:
+            self.out.left_out[m.name, f"messages without {what}"] += 1
             return None
-        if not np.isfinite(told.v).all():
-            raise Refused(f"{what} {told.v.tolist()}, expected finite numbers")
-        return told.v
+        if not np.isfinite(found.v).all():
+            raise Refused(f"{what} {found.v.tolist()}, expected finite numbers")
+        return found.v
 
-    def reading(self, received: Received, robot: str, sensor: str, t_ns: int, columns: tuple[str, ...], y: Any) -> None:
+    def reading(self, m: Incoming, sensor: str, columns: tuple[str, ...], y: Any) -> None:
         """Take a reading of a sensor of the robot itself: one at a time."""
+        robot, t_ns = m.topic.robot, m.t_ns
         if self.read_ns.get((robot, sensor)) == t_ns:
-            self.out.left_out[received.topic, f"readings of {sensor} at the time of the one before"] += 1
+            self.out.left_out[m.name, f"readings of {sensor} at the time of the one before"] += 1
             return
         self.read_ns[robot, sensor] = t_ns
         self.out.sensor_columns.setdefault((robot, sensor), columns)
@@ -103,19 +114,19 @@ class OwnReadings:
         for (robot, sensor), rates in self.rates.items():
             ends = sorted({e.t_ns for e in self.out.events if isinstance(e, Control) and e.robot == robot})
             if not ends:
-                wanted = "controls of this robot, or `at: messages`"
-                raise LogError(f"{where}: {sensor} of {robot!r} has `at: controls`, expected {wanted}")
+                raise LogError(
+                    f"{where}: {sensor} of {robot!r} has `at: controls`, expected controls of this robot, or `at: "
+                    "messages`"
+                )
             t_ns = np.array(sorted(rates))
             found = means(t_ns, np.array([rates[t] for t in t_ns.tolist()]), ends)
             self.out.sensor_columns[robot, sensor] = GYRO[self.in_space(robot)]
             self.out.events += [Scan(t_ns=t, robot=robot, sensor=sensor, y=w[None]) for t, w in found]
 
-    def inertial(self, received: Received, topic: InertialTopic, offer: Message, t_ns: int) -> None:
+    def inertial(self, m: Incoming) -> None:
         """Take rates and specific forces, held from now on; times must increase."""
-        w = self.measured(received, "rates", offer.rates(received.message))  # type: ignore[misc]
-        a = self.measured(received, "accelerations", offer.force(received.message))  # type: ignore[misc]
-        if w is None or a is None:
-            return
-        if self.out.is_next(received, self.read_ns.get((topic.robot, "")), t_ns, "readings"):
-            self.read_ns[topic.robot, ""] = t_ns
-            self.out.events.append(Control(t_ns=t_ns, robot=topic.robot, u=np.concatenate([w, a])))
+        robot, w = m.topic.robot, self.measured(m, "rates", m.offer.rates)
+        a = self.measured(m, "accelerations", m.offer.force)
+        if w is not None and a is not None and self.out.is_next(m, self.read_ns.get((robot, "")), "readings"):
+            self.read_ns[robot, ""] = m.t_ns
+            self.out.events.append(Control(t_ns=m.t_ns, robot=robot, u=np.concatenate([w, a])))

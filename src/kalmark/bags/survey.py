@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.bags.fields import landmark_fields, offers
-from kalmark.bags.messages import MESSAGES, Measured, Message, Pose
+from kalmark.bags.messages import MESSAGES, Measured, Message
 from kalmark.bags.opening import UNDEFINED, Bag, frame_id, has_header, header_time, refuse_undeclared_fields
 from kalmark.bags.tables import holds_log
 from kalmark.bags.tf_frames import Frames
@@ -32,7 +32,7 @@ class Poses:
     frames: list[Array] = field(default_factory=list)
     cov: Array | None = None
 
-    def take(self, t_ns: int, pose: Pose) -> None:
+    def take(self, t_ns: int, pose: Measured) -> None:
         """Take one more pose, unless it is not later than the last; without a rotation it is not turned."""
         if not self.t_ns:
             self.cov = pose.cov
@@ -40,7 +40,7 @@ class Poses:
             self.cov = None
         if not self.t_ns or t_ns > self.t_ns[-1]:
             self.t_ns.append(t_ns)
-            self.frames.append(np.where(np.isnan(pose.frame), [0.0] * 6 + [1.0], pose.frame))
+            self.frames.append(np.where(np.isnan(pose.v), [0.0] * 6 + [1.0], pose.v))
 
     @property
     def flat(self) -> bool:
@@ -147,7 +147,7 @@ def survey(path: Path, definitions: Mapping[str, str] | None = None) -> Survey:
                     transforms = summary.offers.transforms(m) if summary.offers.transforms is not None else []
                 frames.take(transforms)
                 for at, parent, child, frame in transforms:
-                    pairs.setdefault((parent, child), Poses()).take(at, Pose(frame, None, parent, child))
+                    pairs.setdefault((parent, child), Poses()).take(at, Measured(frame))
             except Refused as refused:
                 summary.error = summary.error or str(refused)
         moving = {pair: poses for pair, poses in pairs.items() if pair in frames.moving}
@@ -193,11 +193,11 @@ def _look(summary: TopicSummary, m: Any, t_ns: int) -> None:
         summary.turns = bool(np.abs(offers.twist(m).v).max() > STILL)
     if offers.globe is not None:
         place = offers.globe(m)
-        if place is not None and np.isfinite(place.lla[:2]).all():
-            lla = np.where(np.isfinite(place.lla), place.lla, 0.0)
+        if place is not None and np.isfinite(place.v[:2]).all():
+            lla = np.where(np.isfinite(place.v), place.v, 0.0)
             summary.origin = lla if summary.origin is None else summary.origin
             cov = None if place.cov is None else np.pad(place.cov, (0, 3))
-            summary.poses.take(t_ns, Pose(np.append(lla, [0.0, 0, 0, 1]), cov, summary.frame, ""))
+            summary.poses.take(t_ns, Measured(np.append(lla, [0.0, 0, 0, 1]), cov))
     if offers.camera is not None and summary.camera is None:
         summary.camera = offers.camera(m)
     for name in ("rates", "attitude", "force", "field"):

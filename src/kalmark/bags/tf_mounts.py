@@ -73,8 +73,9 @@ class Mounts:
         raw = self.asked.offers[name].seen is beams_of
         if raw and abs(R[2, 2]) < LEVEL:
             tilt = math.degrees(math.acos(min(1.0, abs(R[2, 2]))))
-            told = f"{name} is tilted by {tilt:.0f} deg in tf, taken as level"
-            self.request.skipped.append(f"{self.asked.bag.path}: {told}")
+            self.request.skipped.append(
+                f"{self.asked.bag.path}: {name} is tilted by {tilt:.0f} deg in tf, taken as level"
+            )
         self.level[name] = (np.eye(3) if raw else R, bool(raw and R[2, 2] < 0))
         flat = {"x_m": float(mount[0]), "y_m": float(mount[1]), "theta_rad": yaw if raw else 0.0}
         self.mounts |= dict.fromkeys(keys, flat)

@@ -18,6 +18,8 @@ from kalmark.geometry.named_poses import POSES
 from kalmark.logs.source import landmark_id, nanoseconds_of_text, spelling_hint
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 
+SensorName = Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."]
+
 
 @declared
 class Topic:
@@ -161,7 +163,7 @@ class Scans(Carried):
 
     needs: ClassVar[tuple[str, ...]] = ("seen",)
 
-    sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
+    sensor: SensorName = None
     take: Annotated[
         Any, "The columns to take of those that the message has, such as [x_m, y_m]; if absent what fits the robot."
     ] = None
@@ -221,7 +223,7 @@ class Images(Carried):
 
     needs: ClassVar[tuple[str, ...]] = ("image",)
 
-    sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
+    sensor: SensorName = None
     info: Annotated[
         str | None, "The topic of its CameraInfo; if absent `camera_info` beside it, as ROS names them."
     ] = None
@@ -266,7 +268,7 @@ class Compass(Sparse):
 
     needs: ClassVar[tuple[str, ...]] = ("field",)
 
-    sensor: Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."] = None
+    sensor: SensorName = None
 
 
 @declared

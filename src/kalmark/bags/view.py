@@ -14,7 +14,7 @@ from kalmark.arrays import Array
 from kalmark.bags.mcap_writer import Outgoing, header_fields, time_fields
 from kalmark.events import Control, Fix
 from kalmark.geometry.rotations import from_matrix
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, poses_of_size
 
 MAP = "map"
 MOST_POSES = 5000  # of a path that is drawn
@@ -30,17 +30,9 @@ def topic(robot: str, *names: str) -> str:
     return "/" + "/".join("".join(c if c.isalnum() and c.isascii() else "_" for c in name) for name in (robot, *names))
 
 
-def pose_in_space(pose: Array) -> Array:
-    """Return a pose (3,) or (7,) as one of space (7,)."""
-    if len(pose) == 7:
-        return pose
-    half = pose[2] / 2
-    return np.array([pose[0], pose[1], 0.0, 0.0, 0.0, np.sin(half), np.cos(half)])
-
-
 def pose_fields(pose: Array) -> dict[str, Any]:
     """Return the fields of a geometry_msgs/Pose, of a pose (3,) or (7,)."""
-    x, y, z, *q = pose_in_space(pose).tolist()
+    x, y, z, *q = poses_of_size(pose[None], 7)[0].tolist()
     return {"position": {"x": x, "y": y, "z": z}, "orientation": dict(zip("xyzw", q, strict=True))}
 
 
