@@ -134,16 +134,11 @@ def _jacobian(c: Array, n1: Array, n2: Array, turn: Array) -> Array:
 @compiled
 def farthest(x: Array, y: Array, i: int, j: int) -> tuple[int, float]:
     """Return which of the points i to j of x, y (N,) is farthest from the chord between these two, and its distance."""
-    dx, dy = x[j] - x[i], y[j] - y[i]
-    length, at, most = math.hypot(dx, dy), i, 0.0
-    for k in range(i + 1, j):
-        if length > 0.0:
-            off = abs(dx * (y[k] - y[i]) - dy * (x[k] - x[i])) / length
-        else:
-            off = math.hypot(x[k] - x[i], y[k] - y[i])
-        if off > most:
-            at, most = k, off
-    return at, most
+    u, v = x[i : j + 1] - x[i], y[i : j + 1] - y[i]
+    length = math.hypot(u[-1], v[-1])
+    off = np.abs(u[-1] * v - v[-1] * u) / length if length > 0.0 else np.hypot(u, v)
+    at = int(np.argmax(off))
+    return i + at, off[at]
 
 
 @compiled

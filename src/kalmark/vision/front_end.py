@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Set
 from dataclasses import dataclass, field, replace
-from time import perf_counter
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -33,7 +32,7 @@ from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane, plane_from_depths, plane_from_match
 from kalmark.vision.recognition import match_expected, recognize_place
-from kalmark.vision.searches import TRIAL, Searches
+from kalmark.vision.searches import TRIAL, Searches, make_room
 from kalmark.vision.selection import Search, Selection
 from kalmark.vision.surveyed_corners import FirstLook
 from kalmark.vision.template_matching import Searcher, shift_covariances
@@ -86,7 +85,7 @@ class Look(Searches):
 
 
 class FrontEnd:
-    """Searches the frames of one sensor; `looks` has how each landmark looked, `times` what the parts took, s."""
+    """Searches the frames of one sensor; `looks` has how each landmark looked."""
 
     takes: ClassVar[type[Raw]] = Frame
     waits: ClassVar[bool] = False
@@ -110,7 +109,6 @@ class FrontEnd:
         self.prospect: Prospect | None = None
         self.image: Any = None
         self.sighting: Found | None = None
-        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "update"), 0.0)
 
     @property
     def begins(self) -> bool:
@@ -143,7 +141,6 @@ class FrontEnd:
     def found(self, raw: Raw, data: tuple[Any, Any], view: FilterView) -> Found:
         """Search an image for the landmarks in view, and for new ones."""
         prospect, (image, beside) = Prospect(view.map, view.tracks, view.channel, view.robot), data
-        t0 = perf_counter()
         settings, cv2 = self.settings, self.cv2
         self.frame += 1
         self.image, self.prospect = image, prospect
@@ -153,7 +150,6 @@ class FrontEnd:
             cv2, views, planes, prospect.places, prospect.T, prospect.sensor, TEMPLATE
         )
         self.beside = beside if isinstance(self.sensor, PixelDepth) else None
-        t1 = perf_counter()
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
         search, drifted = Search(prospect, looks.told, searcher, settings.updates), None
         found = self.selection = search.run(self.random)
@@ -163,22 +159,19 @@ class FrontEnd:
         self.is_lost = found.matched.sum() < FEW
         removed = self._count(prospect, found)
         self._first_look(image, prospect, found)
-        t2 = perf_counter()
         rows = np.flatnonzero(found.matched).tolist()
         y = found.y[rows]
         ids: list[Id] = [prospect.names[k] for k in rows]
         new = self._new(image, found, prospect, len(rows))
         ids += [self._name(raw) for _ in new]
-        removed += self._room(len(new), {name for name, _ in removed}, prospect)
+        stay = {*prospect.names, *(name for name, look in self.looks.items() if look.surveyed)}
+        removed += make_room(self.looks, settings.most - len(new), stay, {name for name, _ in removed})
         y, cov = np.concatenate([y, new]), None
         if isinstance(self.sensor, PixelDepth | Stereo):
             y, cov = self._measured(y, rows, beside, prospect, found)
             self._add_shifts(cov, y, rows)
             there = np.flatnonzero(np.isfinite(y).all(axis=1))
             y, cov, ids = y[there], cov[there], [ids[k] for k in there.tolist()]
-        t3 = perf_counter()
-        for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", t3 - t2)):
-            self.times[part] += spent
         scan = Scan(t_ns=raw.t_ns, robot=raw.robot, sensor=raw.sensor, y=y if len(y) else (), ids=ids or None,
                     cov=cov if len(y) else None)  # fmt: skip
         self.sighting = Found(scan, removed, drifted)
@@ -186,7 +179,7 @@ class FrontEnd:
 
     def update(self, report: Report, view: FilterView) -> Replay | None:
         """Update patches and counts of landmarks by the report of a frame; return what is to be filtered again."""
-        T, t0 = view.T, perf_counter()
+        T = view.T
         assert self.prospect is not None
         at = {name: k for k, name in enumerate(self.prospect.names)}
         for o in report.observations:
@@ -220,7 +213,6 @@ class FrontEnd:
             fitted = {o.landmark: report.y[o.index] for o in report.observations
                       if o.landmark is not None and o.outcome in ("new", "associated")}  # fmt: skip
             self.beginning.add(self.sighting.scan, [name for name, _ in self.sighting.removed], fitted, T)
-        self.times["update"] += perf_counter() - t0
         return self._begun(view.channel.landmark)
 
     # ------------------------------------------------------------------ the beginning
@@ -357,16 +349,3 @@ class FrontEnd:
             removed += [(name, "out of view") for name, look in self.looks.items()
                         if not (name in view or name in gone or look.surveyed)]  # fmt: skip
         return removed
-
-    def _room(self, new: int, gone: set[Id], prospect: Prospect) -> list[tuple[Id, str]]:
-        """Return the landmarks that make room for new ones: out of view, least fitted first."""
-        over = len(self.looks) - len(gone) + new - self.settings.most
-        if over <= 0:
-            return []
-        view = {*prospect.names, *gone}
-        out = sorted(
-            (look.fitted, look.seen, k, name)
-            for k, (name, look) in enumerate(self.looks.items())
-            if name not in view and not look.surveyed
-        )
-        return [(name, "made room") for *_, name in out[:over]]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,30 +70,37 @@ class Prospect:
         self.names: list[Id] = []
         found = [(model, *self._in_view(map_, tracks, model, names)) for model, names in self._sorted(tracks)]
         slots = np.concatenate([np.zeros(0, np.int64), *(s for _, s, l in found if l is None)])
-        m, here, second, at = map_.marginal(slot, channel.second(slot), slots)
+        kept, here, second, at = map_.marginal(slot, channel.second(slot), slots)
         head_mean = channel.head(map_, slot)
-        head = observed_block(m.x, m.blocks, m.atoms, here, second, slots[:0], 0)
+        head = observed_block(kept.x, kept.blocks, kept.atoms, here, second, slots[:0], 0)
         self._groups: list[_Group] = []
-        rows, parts, places = [head[0]], [], []
+        rows, m, widest = [head[0]], len(channel.sensor.columns), max((model.d for model, _, _ in found), default=0)
         h, done, first, taken = len(head[0]), 0, 0, len(head[0])
+        none, no_places = np.zeros(0, np.int64), np.zeros((0, 3))
+        parts = [(np.zeros((0, m)), np.zeros((0, m, h)), np.zeros((0, m, widest)), none, none, no_places)]
         for model, some, known in found:
             k = len(some)
             if known is None:
-                index, table, mean = observed_block(m.x, m.blocks, m.atoms, here, second, at[done : done + k], model.d)
+                index, table, mean = observed_block(
+                    kept.x, kept.blocks, kept.atoms, here, second, at[done : done + k], model.d
+                )
                 own, done = index[h:], done + k
                 l = mean[len(head_mean) :].reshape(k, model.d)
             else:
-                own, table, mean, l = np.zeros(0, np.int64), head[1], head_mean, known
+                own, table, mean, l = none, head[1], head_mean, known
             where = np.concatenate([np.arange(h), np.arange(taken, taken + len(own))])
             self._groups.append(_Group(model, np.arange(first, first + k), mean, table, where, known))
             e, _, E_h, E_l = self._linearized(model, mean[: len(head_mean)], l)
-            parts.append((e, E_h, E_l, np.arange(k) * (len(own) // max(k, 1)) + taken, len(own) // max(k, 1)))
+            size, E = len(own) // max(k, 1), np.zeros((k, m, widest))
+            E[:, :, :size] = E_l[:, :, :size]
+            parts.append((e, E_h, E, np.arange(k) * size + taken, np.full(k, size), _places(model, l)))
             rows.append(own)
-            places.append(_places(model, l))
             first, taken = first + k, taken + len(own)
-        self.places = np.concatenate([np.zeros((0, 3)), *places])
-        self.R = self._noise(parts)
-        self.belief = self._joint(m.P, np.concatenate(rows), h, parts)
+        e, E_h, E_l, begins, widths, self.places = map(np.concatenate, zip(*parts, strict=True))
+        self.R = np.array(channel.sensor.noise(e)) if len(e) else np.zeros((0, m, m))
+        index = np.concatenate(rows)
+        C, S = joint(kept.P, index, E_h, E_l, begins, widths)
+        self.belief = Belief(e, S, C, np.zeros(len(index)))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -121,25 +128,6 @@ class Prospect:
         y = np.zeros((len(l), len(self.channel.sensor.columns)))
         return linearize(model.model, np.ascontiguousarray(head), np.ascontiguousarray(l), y)
 
-    def _noise(self, parts: list[Any]) -> Array:
-        m = len(self.channel.sensor.columns)
-        e = np.concatenate([np.zeros((0, m)), *(part[0] for part in parts)])
-        return np.array(self.channel.sensor.noise(e)) if len(e) else np.zeros((0, m, m))
-
-    def _joint(self, P: Array, rows: Index, h: int, parts: list[Any]) -> Belief:
-        m = len(self.channel.sensor.columns)
-        widest = max((part[4] for part in parts), default=0)
-        e = np.concatenate([np.zeros((0, m)), *(part[0] for part in parts)])
-        E_h, E_l = np.zeros((len(e), m, h)), np.zeros((len(e), m, widest))
-        at, width, first = np.zeros(len(e), np.int64), np.zeros(len(e), np.int64), 0
-        for e_part, own_h, own_l, start, size in parts:
-            some = slice(first, first + len(e_part))
-            E_h[some] = own_h
-            E_l[some, :, :size] = own_l[:, :, :size]
-            at[some], width[some], first = start, size, first + len(e_part)
-        C, S = joint(P, rows, E_h, E_l, at, width)
-        return Belief(e, S, C, np.zeros(len(rows)))
-
     # ------------------------------------------------------------------ corrections by measurements
     def innovations(self, belief: Belief, rows: Index) -> Array:
         """Return the covariances Z (k, 2, 2) of the innovations of some landmarks' pixels, each by itself."""
@@ -153,7 +141,9 @@ class Prospect:
 
     def moved(self, belief: Belief, rows: Sequence[int] | Index, y: Array) -> Array:
         """Return d (N,) after measurements y (k, 2) of some landmarks."""
-        return belief.d + self._gain(belief, rows) @ (y - belief.pixels[rows]).ravel()
+        C = belief.C[:, _of_pixels(belief, rows)]
+        K = np.linalg.solve(self._innovation(belief, rows), C.T).T
+        return np.asarray(belief.d + K @ (y - belief.pixels[rows]).ravel(), dtype=np.float64)
 
     def expected(self, d: Array) -> Array:
         """Return what is expected (K, m) of all landmarks from the mean moved by d (N,)."""
@@ -170,9 +160,8 @@ class Prospect:
 
     def after(self, belief: Belief, rows: Sequence[int] | Index, y: Array) -> Belief:
         """Return the density after measurements y (k, 2) of some landmarks."""
-        flat = _of_pixels(belief, rows)
-        K, S_i = self._gain(belief, rows), belief.S[flat]
-        d = belief.d + K @ (y - belief.pixels[rows]).ravel()
+        flat, d = _of_pixels(belief, rows), self.moved(belief, rows, y)
+        S_i = belief.S[flat]
         G = np.linalg.solve(self._innovation(belief, rows), S_i)
         return Belief(self.expected(d), belief.S - S_i.T @ G, belief.C - belief.C[:, flat] @ G, d)
 
@@ -182,11 +171,6 @@ class Prospect:
         for k, i in enumerate(rows):
             Z[p * k : p * k + p, p * k : p * k + p] += self.R[i, :p, :p]
         return Z
-
-    def _gain(self, belief: Belief, rows: Sequence[int] | Index) -> Array:
-        flat = _of_pixels(belief, rows)
-        K = np.linalg.solve(self._innovation(belief, rows), belief.C[:, flat].T).T
-        return np.asarray(K, dtype=np.float64)
 
 
 def _of_pixels(belief: Belief, rows: Sequence[int] | Index) -> Index:
@@ -212,10 +196,20 @@ def places_of(map_: Map, tracks: Tracks, channel: Channel, names: list[Id]) -> A
 
 
 @compiled
+def product(E_h: Array, E_l: Array, v: Array, first: int) -> float:
+    """Return the product of a row of Jacobians, of the head (h,) and of the block from `first` on, with v (N,)."""
+    s = 0.0
+    for c in range(len(E_h)):
+        s += E_h[c] * v[c]
+    for c in range(len(E_l)):
+        s += E_l[c] * v[first + c]
+    return s
+
+
+@compiled
 def joint(P: Array, rows: Index, E_h: Array, E_l: Array, at: Index, width: Index) -> tuple[Array, Array]:
     """Return C = P H' (N, K p) and S = H C (K p, K p) of expectations of the head and of one landmark each."""
-    k, p, h = E_h.shape
-    N = len(rows)
+    (k, p, _), N = E_h.shape, len(rows)
     C, S = np.zeros((N, k * p)), np.zeros((k * p, k * p))
     row = np.empty(N)
     for r in range(N):
@@ -226,20 +220,10 @@ def joint(P: Array, rows: Index, E_h: Array, E_l: Array, at: Index, width: Index
         for o in range(k):
             first = at[o]
             for a in range(p):
-                s = 0.0
-                for c in range(h):
-                    s += E_h[o, a, c] * row[c]
-                for c in range(width[o]):
-                    s += E_l[o, a, c] * row[first + c]
-                C[r, o * p + a] = s
+                C[r, o * p + a] = product(E_h[o, a], E_l[o, a, : width[o]], row, first)
     for o in range(k):
         first = at[o]
         for a in range(p):
             for j in range(k * p):
-                s = 0.0
-                for c in range(h):
-                    s += E_h[o, a, c] * C[c, j]
-                for c in range(width[o]):
-                    s += E_l[o, a, c] * C[first + c, j]
-                S[o * p + a, j] = s
+                S[o * p + a, j] = product(E_h[o, a], E_l[o, a, : width[o]], C[:, j], first)
     return C, S

@@ -12,7 +12,8 @@ def opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        what = "OpenCV, which searches images, is not installed, expected it"
-        raise ModelError(f"{what}: pip install 'kalmark[opencv]'") from None
+        raise ModelError(
+            "OpenCV, which searches images, is not installed, expected it: pip install 'kalmark[opencv]'"
+        ) from None
     cv2.setNumThreads(1)
     return cv2

@@ -22,6 +22,7 @@ from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.rotations import matrix
 from kalmark.vision.depth_images import EDGE
+from kalmark.vision.template_matching import LEAST_GAIN, fit_template
 
 SIGMA_SLOPE = 1.0  # of the prior: 45 deg
 STEEPEST = 2.0  # 63 deg
@@ -90,40 +91,9 @@ def plane_from_match(image: Any, template: Any, y: Array, slopes: Array, rates: 
 @compiled
 def slopes_shown(image: Any, template: Any, y: Array, rates: Array) -> tuple[Array, Array]:
     """Return ds (2,) and its information (2, 2), NaN where the image (H, W) about y (2,) shows nothing."""
-    s = template.shape[0]
-    h, column = s // 2, np.empty(6)
-    A, b, whole, n = np.zeros((6, 6)), np.zeros(6), 0.0, 0
-    none = np.full(2, np.nan), np.zeros((2, 2))
-    left, above = int(np.floor(y[0])), int(np.floor(y[1]))
-    du, dv = y[0] - left, y[1] - above
-    if left < h or above < h or left + h + 1 >= image.shape[1] or above + h + 1 >= image.shape[0]:
-        return none
-    for j in range(1, s - 1):
-        for i in range(1, s - 1):
-            u, v = left + i - h, above + j - h
-            value = (1.0 - dv) * ((1.0 - du) * image[v, u] + du * image[v, u + 1])
-            value += dv * ((1.0 - du) * image[v + 1, u] + du * image[v + 1, u + 1])
-            T_u = 0.5 * (float(template[j, i + 1]) - float(template[j, i - 1]))
-            T_v = 0.5 * (float(template[j + 1, i]) - float(template[j - 1, i]))
-            x, w = float(i - h), float(j - h)
-            column[0], column[1], column[2], column[3] = float(template[j, i]), 1.0, -T_u, -T_v
-            for a in range(2):
-                column[4 + a] = -T_u * (rates[a, 0, 0] * x + rates[a, 0, 1] * w)
-                column[4 + a] -= T_v * (rates[a, 1, 0] * x + rates[a, 1, 1] * w)
-            for p in range(6):
-                b[p] += column[p] * value
-                for q in range(p + 1):
-                    A[p, q] += column[p] * column[q]
-            whole += value * value
-            n += 1
-    for p in range(6):
-        for q in range(p):
-            A[q, p] = A[p, q]
-        A[p, p] += 1e-6 * (1.0 + A[p, p])
-    found = np.linalg.solve(A, b)
-    variance = max(float(whole - found @ b) / (n - 6), LEAST_VARIANCE)
+    found, inverse, rest = fit_template(image, template, y, rates)
     gain = found[0]
-    if not gain > 0.1:
-        return none
-    C = np.linalg.inv(A)[4:, 4:].copy() * (REPEATED * variance / gain**2)
-    return found[4:] / gain, np.linalg.inv(C)
+    if not gain > LEAST_GAIN:
+        return np.full(2, np.nan), np.zeros((2, 2))
+    variance = max(rest / ((template.shape[0] - 2) ** 2 - 6), LEAST_VARIANCE)
+    return found[4:] / gain, np.linalg.inv(inverse[4:, 4:] * (REPEATED * variance / gain**2))

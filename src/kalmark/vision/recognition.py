@@ -23,7 +23,7 @@ from kalmark.vision.template_matching import Searcher
 SIZES = (1.0, 0.7, 0.5)  # of the image, in which corners are described
 CORNERS, APART_PX, QUALITY = 600, 5, 0.01
 REACH = 12  # half width of what is described, px
-MARGIN = 20  # about each patch where all are described together
+MARGIN = 20  # about each patch: what describes it reaches beyond it
 NEAREST, CLEARER = 70, 0.85  # bits of 256 that may differ, and those of the next landmark that it must stay below
 LEAST = 10  # pairs that agree with a pose
 OFF_PX, TRIES, SURE = 3.0, 300, 0.999
@@ -89,21 +89,13 @@ def recognize_place(
 
 def describe_views(cv2: Any, orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any, Index]:
     """Return the bits (N, 256) that describe all views, and the number (N,) of the landmark of each."""
-    owner = np.array([k for k, own in enumerate(views) for _ in own], dtype=np.int64)
-    patches = [view.patch for own in views for view in own]
-    if not patches:
-        return np.zeros((0, 256), np.float32), owner
-    across, side = int(np.ceil(np.sqrt(len(patches)))), patches[0].shape[0] + 2 * MARGIN
-    whole = np.zeros((-(-len(patches) // across) * side, across * side), np.uint8)
-    for k, patch in enumerate(patches):
-        row, column = side * (k // across), side * (k % across)
-        whole[row : row + side, column : column + side] = cv2.copyMakeBorder(
-            patch, MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_REPLICATE
-        )
-    number = np.arange(len(patches))
-    middle = side // 2 + side * np.column_stack([number % across, number // across])
-    bits, which = describe_pixels(cv2, orb, whole, middle.astype(np.float64))
-    return bits, owner[which]
+    bits, owner = [np.zeros((0, 256), np.float32)], list[int]()
+    for k, patch in ((k, view.patch) for k, own in enumerate(views) for view in own):
+        wide = cv2.copyMakeBorder(patch, MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_REPLICATE)
+        some, _ = describe_pixels(cv2, orb, wide, np.array([[wide.shape[1] // 2, wide.shape[0] // 2]]))
+        bits.append(some)
+        owner += [k] * len(some)
+    return np.concatenate(bits), np.array(owner, dtype=np.int64)
 
 
 def describe_corners(cv2: Any, orb: Any, image: Any) -> tuple[Any, Array]:

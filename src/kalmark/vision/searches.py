@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
+from kalmark.events import Id
 
 TRIAL = 10  # searches after which a landmark may be given up
 LEAST_SHARE = 0.5  # of its searches in which one is found and fits; fewer: it is given up
@@ -38,3 +41,13 @@ class Searches:
         """Count a match in a frame, d2 being that of what it left, a number measured."""
         self.fitted, self.missed, self.seen = self.fitted + 1, 0, frame
         self.misfit += (d2 - self.misfit) / min(self.fitted, RECENT)
+
+
+def make_room(looks: Mapping[Id, Searches], most: int, stay: Iterable[Id], gone: set[Id]) -> list[tuple[Id, str]]:
+    """Return the landmarks above the number `most` that make room for new ones, least fitted first.
+
+    Those that `stay`, as they are in view, do not; those that are `gone` do not count any more.
+    """
+    stay = {*stay, *gone}
+    out = sorted((look.fitted, look.seen, k, name) for k, (name, look) in enumerate(looks.items()) if name not in stay)
+    return [(name, "made room") for *_, name in out[: max(len(looks) - len(gone) - most, 0)]]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Set
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from kalmark.report import Expectations, Report
 from kalmark.slam.sources import FilterView, Found
 from kalmark.tracks.expecting import expectations
 from kalmark.vision.opencv import opencv
-from kalmark.vision.searches import TRIAL, Searches
+from kalmark.vision.searches import TRIAL, Searches, make_room
 
 GATE = gate(0.99, 2)
 TURNED = np.sin(np.radians(20.0))  # a segment may be turned against what is expected, at most
@@ -80,7 +79,7 @@ class Matches(NamedTuple):
 
 
 class LineFrontEnd:
-    """Searches the frames of one sensor for lines; `looks` has how each looked, `times` what the parts took, s."""
+    """Searches the frames of one sensor for lines; `looks` has how each looked."""
 
     takes: ClassVar[type[Raw]] = Frame
     waits: ClassVar[bool] = True
@@ -100,7 +99,6 @@ class LineFrontEnd:
         self.matches: Matches | None = None
         self._numbers: list[int] = []  # of the segments of the last scan
         self.image: Any = None
-        self.times: dict[str, float] = dict.fromkeys(("search", "match", "start", "update"), 0.0)
 
     def read(self, raw: Frame) -> Any:
         """Return the image (H, W) of a frame.  Raises EventError."""
@@ -112,11 +110,9 @@ class LineFrontEnd:
     def found(self, raw: Raw, data: Any, view: FilterView) -> Found:
         """Search an image (H, W) for the lines expected, and for new ones."""
         image, expected = data, expectations(view.map, view.tracks, view.channel, view.robot, "", only_in_view=True)
-        t0 = perf_counter()
         self.frame, self.image, self.expected = self.frame + 1, image, expected
         segments = self._detected(image)
         across = profiles(self.cv2, image, segments)
-        t1 = perf_counter()
         known = [self.looks.get(name) for name in expected.names]
         mine = np.array([np.zeros(across.shape[1]) if look is None or look.profile is None else look.profile
                          for look in known]).reshape(len(known), across.shape[1])  # fmt: skip
@@ -130,24 +126,20 @@ class LineFrontEnd:
                 removed.append((name, reason))
         removed += [(name, f"out of view, {look.fitted} fits before") for name, look in self.looks.items()
                     if look.fitted < TRIAL and name not in expected.names]  # fmt: skip
-        t2 = perf_counter()
         rows = np.flatnonzero(of >= 0)
         new = self._new(expected, len(rows))
-        removed += self._room(len(new), {name for name, _ in removed})
+        removed += make_room(self.looks, self.settings.most - len(new), expected.names, {name for name, _ in removed})
         ids: list[Id] = [expected.names[k] for k in rows.tolist()]
         for _ in new:
             self.named += 1
             ids.append(f"{raw.robot}.{raw.sensor} {self.named}")
         y = segments[np.concatenate([of[rows], new]).astype(np.int64)]
-        for part, spent in (("search", t1 - t0), ("match", t2 - t1), ("start", perf_counter() - t2)):
-            self.times[part] += spent
         scan = Scan(t_ns=raw.t_ns, robot=raw.robot, sensor=raw.sensor, y=y if len(y) else (), ids=ids or None)
         self._numbers = [*of[rows].tolist(), *new]
         return Found(scan, removed)
 
     def update(self, report: Report, view: FilterView) -> None:
         """Update profiles and counts of lines by the report of a frame."""
-        t0 = perf_counter()
         assert self.matches is not None
         for o in report.observations:
             if o.landmark is None or o.outcome not in ("new", "associated"):
@@ -159,7 +151,6 @@ class LineFrontEnd:
             look.seen = self.frame
         for name, _ in report.removed:
             self.looks.pop(name, None)
-        self.times["update"] += perf_counter() - t0
 
     def _detected(self, image: Any) -> Array:
         """Return the segments (M, 4) of an image."""
@@ -184,15 +175,6 @@ class LineFrontEnd:
                 new.append(k)
                 taken = np.concatenate([taken, segments[k : k + 1]])
         return new
-
-    def _room(self, new: int, gone: set[Id]) -> list[tuple[Id, str]]:
-        """Return the lines that make room for new ones: out of view, least fitted first."""
-        assert self.expected is not None
-        over, view = len(self.looks) - len(gone) + new - self.settings.most, {*self.expected.names, *gone}
-        out = sorted(
-            (of.fitted, of.seen, k, name) for k, (name, of) in enumerate(self.looks.items()) if name not in view
-        )
-        return [(name, "made room") for *_, name in out[: max(over, 0)]]
 
     # ------------------------------------------------------------------ what a source is asked besides
     def settle(self) -> None:

@@ -19,6 +19,7 @@ COARSE_LESS = 0.15  # the score may be so much lower there
 COARSE_BEST = 3  # maxima there that are looked at in full resolution
 EARLY_LESS = 0.25  # the score of every fourth pixel may be so much lower
 OUTSIDE = -2.0  # the score of what is not in the image
+LEAST_GAIN = 0.1  # of a template where it is found: with less contrast it is something else
 
 
 class Searcher:
@@ -57,15 +58,15 @@ class Searcher:
         if self._half is None:
             self._half = self.cv2.pyrDown(self.image)
         template = self.cv2.pyrDown(self.templates[which])
-        h, (height, width), at = template.shape[0] // 2, self._half.shape, e / 2
-        left, right = max(math.ceil(at[0] - r[0] / 2), h), min(math.floor(at[0] + r[0] / 2), width - 1 - h)
-        top, bottom = max(math.ceil(at[1] - r[1] / 2), h), min(math.floor(at[1] + r[1] / 2), height - 1 - h)
+        h, size = template.shape[0] // 2, np.array(self._half.shape[::-1])
+        low = np.maximum(np.ceil(e / 2 - r / 2), h).astype(np.int64)
+        end = np.minimum(np.floor(e / 2 + r / 2), size - 1 - h).astype(np.int64) + 1
         best, most = e, OUTSIDE
-        if left > right or top > bottom:
+        if (low >= end).any():
             return best, most
-        region = self._half[top - h : bottom + h + 1, left - h : right + h + 1]
+        region = self._half[low[1] - h : end[1] + h, low[0] - h : end[0] + h]
         scores = self.cv2.matchTemplate(region, template, self.cv2.TM_CCOEFF_NORMED)
-        x, y = 2.0 * np.arange(left, right + 1) - e[0], 2.0 * np.arange(top, bottom + 1) - e[1]
+        x, y = (2.0 * np.arange(first, stop) - at for first, stop, at in zip(low, end, e, strict=True))
         W = np.linalg.inv(Z)
         inside = W[0, 0] * x**2 + 2 * W[0, 1] * y[:, None] * x + W[1, 1] * (y**2)[:, None] <= d2
         scores = np.where(inside, scores, OUTSIDE)
@@ -166,37 +167,50 @@ def top(image: Any, template: Any, u: int, v: int) -> tuple[float, float]:
 
 
 @compiled
+def fit_template(image: Any, template: Any, y: Array, rates: Array) -> tuple[Array, Array, float]:
+    """Return gain g, offset o, shift t and slopes ds (4 + m,) of a template (s, s) found at y (2,), by least squares.
+
+    I(x) = g T(x) + o - T_x (x_s ds + t), rates x_s (m, 2, 2), each a matrix that multiplies x.  Then the inverse of the
+    information, for a variance of 1, and the sum of the squares that are left.  NaN where it is partly outside.
+    """
+    s, m = template.shape[0], 4 + len(rates)
+    h, column, A, b, whole = s // 2, np.empty(m), np.zeros((m, m)), np.zeros(m), 0.0
+    left, above = int(np.floor(y[0])), int(np.floor(y[1]))
+    if left < h or above < h or left + h + 1 >= image.shape[1] or above + h + 1 >= image.shape[0]:
+        return np.full(m, np.nan), A, 0.0
+    du, dv = y[0] - left, y[1] - above
+    for j in range(1, s - 1):
+        for i in range(1, s - 1):
+            u, v = left + i - h, above + j - h
+            value = (1.0 - dv) * ((1.0 - du) * image[v, u] + du * image[v, u + 1])
+            value += dv * ((1.0 - du) * image[v + 1, u] + du * image[v + 1, u + 1])
+            T_u = 0.5 * (float(template[j, i + 1]) - float(template[j, i - 1]))
+            T_v = 0.5 * (float(template[j + 1, i]) - float(template[j - 1, i]))
+            column[0], column[1], column[2], column[3] = float(template[j, i]), 1.0, -T_u, -T_v
+            for a in range(m - 4):
+                column[4 + a] = -T_u * (rates[a, 0, 0] * (i - h) + rates[a, 0, 1] * (j - h))
+                column[4 + a] -= T_v * (rates[a, 1, 0] * (i - h) + rates[a, 1, 1] * (j - h))
+            for p in range(m):
+                b[p] += column[p] * value
+                for q in range(m):
+                    A[p, q] += column[p] * column[q]
+            whole += value * value
+    for p in range(m):
+        A[p, p] += 1e-6 * (1.0 + A[p, p])
+    found: Any = np.linalg.solve(A, b)
+    inverse: Any = np.linalg.inv(A)
+    return found, inverse, float(whole - found @ b)
+
+
+@compiled
 def shift_covariances(image: Any, templates: Any, which: Index, y: Array) -> Array:
     """Return the covariances (k, 2, 2) of least-squares shifts of templates `which` (k,) that were found at y (k, 2).
 
-    The image about y is I(x) = g T(x) + o - g T_x t: gain, offset and shift t by least squares over the template, with
-    the variance of what they leave.  Zero where the template is partly outside, or belongs to another image.
+    With the variance of what the fit leaves.  Zero where the template is partly outside, or belongs to another image.
     """
-    k, s = len(which), templates.shape[1]
-    C, h, row = np.zeros((k, 2, 2)), s // 2, np.empty(4)
-    for o in range(k):
-        left, above = int(np.floor(y[o, 0])), int(np.floor(y[o, 1]))
-        if left < h or above < h or left + h + 1 >= image.shape[1] or above + h + 1 >= image.shape[0]:
-            continue
-        template, du, dv = templates[which[o]], y[o, 0] - left, y[o, 1] - above
-        A, b, whole = np.zeros((4, 4)), np.zeros(4), 0.0
-        for j in range(1, s - 1):
-            for i in range(1, s - 1):
-                u, v = left + i - h, above + j - h
-                value = (1.0 - dv) * ((1.0 - du) * image[v, u] + du * image[v, u + 1])
-                value += dv * ((1.0 - du) * image[v + 1, u] + du * image[v + 1, u + 1])
-                row[0], row[1] = float(template[j, i]), 1.0
-                row[2] = 0.5 * (float(template[j, i - 1]) - float(template[j, i + 1]))
-                row[3] = 0.5 * (float(template[j - 1, i]) - float(template[j + 1, i]))
-                for p in range(4):
-                    b[p] += row[p] * value
-                    for q in range(4):
-                        A[p, q] += row[p] * row[q]
-                whole += value * value
-        for p in range(4):
-            A[p, p] += 1e-6 * (1.0 + A[p, p])
-        x = np.linalg.solve(A, b)
-        if x[0] > 0.1:
-            variance = max(whole - x @ b, 0.0) / ((s - 2) ** 2 - 4) / x[0] ** 2
-            C[o] = variance * np.linalg.inv(A)[2:, 2:]
+    C, no_slopes = np.zeros((len(which), 2, 2)), np.zeros((0, 2, 2))
+    for o in range(len(which)):
+        found, inverse, rest = fit_template(image, templates[which[o]], y[o], no_slopes)
+        if found[0] > LEAST_GAIN:
+            C[o] = max(rest, 0.0) / ((templates.shape[1] - 2) ** 2 - 4) / found[0] ** 2 * inverse[2:, 2:]
     return C
