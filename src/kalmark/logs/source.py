@@ -286,6 +286,20 @@ def timed_rows(
         raise LogError(f"{path}:1: no rows of data, expected columns {', '.join(('t_s', *names))}")
 
 
+def increasing_times(file: Path) -> Iterator[tuple[int, int, list[str]]]:
+    """Yield (line, t_ns, other cells) of rows that begin with a time in s, which increases.  Raises LogError."""
+    last_ns = -_T_MAX_NS
+    for line, (cell, *rest) in text_rows(file):
+        try:
+            t_ns = nanoseconds_of_text(cell)
+        except ValueError:
+            raise LogError(f"{file}:{line}: {short_text(cell)}, expected a time in s") from None
+        if t_ns <= last_ns:
+            raise LogError(f"{file}:{line}: the time {cell} s is not after the one before, expected increasing times")
+        last_ns = t_ns
+        yield line, t_ns, rest
+
+
 # ------------------------------------------------------------------ rigs: poses of other conventions, YAML files
 def frame(position: Any, matrix: Any) -> Array:
     """Return the frame (7,), x y z qx qy qz qw, of a position (3,) and a rotation matrix (3, 3), local to global."""

@@ -22,7 +22,15 @@ from kalmark.events import Frame, short_text
 from kalmark.logs.image_files import ENDINGS, Forward, frames_of, video_facts, video_images
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows, read_path
-from kalmark.logs.source import Format, Request, frame, nanoseconds_of_text, number_of_text, text_rows
+from kalmark.logs.source import (
+    Format,
+    Request,
+    frame,
+    increasing_times,
+    nanoseconds_of_text,
+    number_of_text,
+    text_rows,
+)
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ogv")
 TIMES = "times.txt"
@@ -120,16 +128,7 @@ def named_time(stem: str) -> int | None:
 
 def read_times(file: Path, count: int) -> list[int]:
     """Return the times (ns) of so many images: the first number of each row, in s.  Raises LogError."""
-    t_ns: list[int] = []
-    for line, cells in text_rows(file):
-        try:
-            t_ns.append(nanoseconds_of_text(cells[0]))
-        except ValueError:
-            raise LogError(f"{file}:{line}: {short_text(cells[0])}, expected a time in s") from None
-        if len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
-            raise LogError(
-                f"{file}:{line}: the time {cells[0]} s is not after the one before, expected increasing times"
-            )
+    t_ns = [t for _, t, _ in increasing_times(file)]
     if len(t_ns) != count:
         raise LogError(f"{file}: {len(t_ns)} times for {count} images, expected one each")
     return t_ns

@@ -15,11 +15,10 @@ import numpy as np
 from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera_log, camera_section
 from kalmark.declare import Within
 from kalmark.errors import LogError
-from kalmark.events import short_text
 from kalmark.logs.image_files import DEPTH_SCALE, frames_of
 from kalmark.logs.log import Log
 from kalmark.logs.poses import read_path
-from kalmark.logs.source import Format, Request, nanoseconds_of_text, text_rows
+from kalmark.logs.source import Format, Request, increasing_times
 
 NEAR_NS = 20_000_000
 SIZE = {"width_px": 640, "height_px": 480}
@@ -71,16 +70,10 @@ def published_calibration(name: str) -> dict[str, Any]:
 def read_list(file: Path) -> dict[int, Path]:
     """Return files by their times (ns), which increase, of rows `t_s file`.  Raises LogError."""
     found: dict[int, Path] = {}
-    last = None
-    for line, cells in text_rows(file):
-        try:
-            t_ns = nanoseconds_of_text(cells[0])
-        except ValueError:
-            raise LogError(f"{file}:{line}: {short_text(cells[0])}, expected a time in s") from None
-        if len(cells) != 2 or (last is not None and t_ns <= last):
-            what = "a time that is not after the one before" if len(cells) == 2 else f"{len(cells)} cells"
-            raise LogError(f"{file}:{line}: {what}, expected increasing times, each with a file")
-        found[t_ns], last = file.parent / cells[1], t_ns
+    for line, t_ns, names in increasing_times(file):
+        if len(names) != 1:
+            raise LogError(f"{file}:{line}: {len(names) + 1} cells, expected a time and a file")
+        found[t_ns] = file.parent / names[0]
     if not found:
         raise LogError(f"{file}:1: no rows of data, expected times and files")
     return found
