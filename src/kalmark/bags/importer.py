@@ -37,7 +37,7 @@ from kalmark.bags.topics import (
     Truths,
     topic_of,
 )
-from kalmark.declare import Values
+from kalmark.declare import Values, registered_name
 from kalmark.errors import EventError, LogError
 from kalmark.events import Control, Fix, Frame, Scan, fixed_seconds, sort_key
 from kalmark.geometry import rotations
@@ -131,7 +131,7 @@ class _Importer:
         robots: dict[str, dict[str, Any]] = {}
         for topic in self.topics.values():
             if topic.columns:
-                robots.setdefault(topic.robot, {})["motion"] = {"type": type_of(topic)}
+                robots.setdefault(topic.robot, {})["motion"] = {"type": registered_name(type(topic))}
         for (robot, sensor), camera in self.cameras.items():
             robots.setdefault(robot, {}).setdefault("sensors", {})[sensor] = camera
         for (robot, sensor), mount in self.mounts.mounts.items():
@@ -379,13 +379,6 @@ def polar(p: Array, space: bool) -> dict[str, Array]:
     if not space:
         return {"range_m": across, "bearing_rad": angle}
     return {"range_m": np.hypot(across, z), "azimuth_rad": angle, "elevation_rad": np.arctan2(z, across)}
-
-
-def type_of(topic: Topic) -> str:
-    """Return the type of a topic as configurations write it."""
-    from kalmark.declare import registered_name
-
-    return registered_name(type(topic)) or type(topic).__name__
 
 
 def images_of(path: Path, name: str) -> Iterator[Any]:

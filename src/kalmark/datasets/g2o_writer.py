@@ -78,7 +78,10 @@ def graph(run: Run, log: Log, robots: Mapping[str, Robot]) -> Iterator[str]:
     yield from _vertices(chain, nodes, robots)
     yield from _landmarks(number, known, d)
     yield from _moves(chain)
-    yield from (_sight(node, number[name], p, C) for node, name, p, C in sights if name in number)
+    for node, name, p, C in sights:
+        if name in number:
+            tag, ids = ("EDGE_SE2_XY", []) if len(p) == 2 else ("EDGE_SE3_TRACKXYZ", [0])
+            yield _line(tag, [node, number[name], *ids], p, C)
 
 
 def _observed(event: Scan | Raw, robot: Robot, history: Any, rows: list[int]) -> Iterator[tuple[str, Array, Array]]:
@@ -136,12 +139,6 @@ def _moves(chain: Chain) -> Iterator[str]:
             J[:3, :3], J[3:, 3:] = R.T, R.T / 2  # of a turn g2o takes the vector part of a quaternion
         tag = "EDGE_SE2" if len(node.step) == 3 else "EDGE_SE3:QUAT"
         yield _line(tag, [node.previous, k], node.step, J @ C @ J.T)
-
-
-def _sight(node: int, number: int, p: Array, C: Array) -> str:
-    if len(p) == 2:
-        return _line("EDGE_SE2_XY", [node, number], p, C)
-    return _line("EDGE_SE3_TRACKXYZ", [node, number, 0], p, C)
 
 
 def _line(tag: str, ids: list[int], values: Array, C: Array | None = None) -> str:
