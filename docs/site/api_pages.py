@@ -34,6 +34,7 @@ PARTS = [
     ("Events", "kalmark.events", "kalmark.events"),
     ("Reports", "kalmark.report", "kalmark.report"),
     ("History of a run", "kalmark.results.history", "kalmark.results.history"),
+    ("Names of points in a picture", "kalmark.results.labels", "kalmark.results.labels"),
     ("Verdict", "kalmark.diagnosis.verdict", "kalmark.diagnosis.verdict"),
     ("Logs", "kalmark.logs", "kalmark.logs"),
     ("Configurations", "kalmark.config", "kalmark.config"),

@@ -12,6 +12,7 @@ it can start a landmark, where the point is that it measures, [S] (3).
 #
 # ``km.pointwise`` makes a sensor of plain functions and takes the Jacobians by differences. This one measures the
 # time of flight of an echo (ms) and the sine of its bearing.
+import matplotlib.pyplot as plt
 import numpy as np
 
 import kalmark as km
@@ -39,9 +40,11 @@ slam.process(km.Control(t_s=0.0, robot="rover", u=(0.4, 0.0)))
 for t in np.arange(0.0, 5.0, 0.5):
     seen = np.array([[3.0, 1.0], [4.0, -1.0]]) - [0.2 + 0.4 * t, 0.0]
     y = [echo(one) for one in seen]
-    slam.process(km.Scan(t_s=t, robot="rover", sensor="sonar", y=y, ids=[1, 2]))
+    report = slam.process(km.Scan(t_s=t, robot="rover", sensor="sonar", y=y, ids=[1, 2]))
 for row in slam.landmarks():
     print(row.id, row.mean.round(3), "m, sigmas", np.sqrt(np.diag(row.covariance)).round(3), "m")
+km.draw(slam, report=report, labels=True).figure.legend(loc="outside lower center", ncols=2)
+plt.show()
 
 # %%
 # With a name in the configuration

@@ -11,6 +11,7 @@ A landmark is a list of atoms (a point, a heading, a scalar, ...) and two functi
 # -------------------------------
 from typing import ClassVar
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 import kalmark as km
@@ -55,14 +56,21 @@ reader = km.pointwise(look, noise=noise, inverse=where, columns=columns, angular
 # In the filter
 # -------------
 #
-# One sign also fixes the robot's heading: a point does not.
+# One sign also fixes the robot's heading: a point does not. The black line is the arm,
+# between its limits of 3 sigma.
 rover = km.Robot("rover", km.motion.Unicycle(), sensors={"eye": km.Mount(reader)})
 slam = km.Slam(rover, landmarks=Sign())
 for t in range(4):
     slam.process(km.Control(t_s=float(t), robot="rover", u=(0.0, 0.0)))
     y = [look(np.array([3.0, 1.0, 2.0]))]
     slam.process(km.Scan(t_s=float(t), robot="rover", sensor="eye", y=y, ids=["exit"]))
-print(slam.mean("exit").round(3), "sigmas", np.sqrt(np.diag(slam.covariance("exit"))).round(3))
+sign, sigmas = slam.mean("exit"), np.sqrt(np.diag(slam.covariance("exit")))
+print(sign.round(3), "sigmas", sigmas.round(3))
+ax = km.draw(slam, labels=True)
+for angle, style in zip(sign[2] + sigmas[2] * np.array([0, -3, 3]), ("k", "k:", "k:"), strict=True):
+    ax.plot(sign[0] + np.array([0, np.cos(angle)]), sign[1] + np.array([0, np.sin(angle)]), style)
+ax.autoscale()
+plt.show()
 
 # %%
 # Try changing

@@ -14,6 +14,8 @@ A format is a function that finds a log in a path and one that reads it as ``Con
 from pathlib import Path
 from tempfile import mkdtemp
 
+import matplotlib.pyplot as plt
+
 import kalmark as km
 from kalmark.logs import FORMATS
 from kalmark.logs.source import Format
@@ -57,7 +59,10 @@ FORMATS["walk"] = Format("walk", "a file that ends in .walk", find, read)
 log = km.open_log(file)
 print(log)
 rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
-print(km.record(km.Slam(rover), log, progress=False))
+run = km.record(km.Slam(rover), log, progress=False)
+print(run)
+km.draw(run.final_slam(), path=run.history.poses, labels=True).figure.legend(loc="outside lower center", ncols=2)
+plt.show()
 
 # %%
 # Try changing

@@ -15,6 +15,7 @@ of a pair.
 # observation; ``threshold`` returns the gate, by default that of the estimator.
 from typing import Annotated
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 import kalmark as km
@@ -42,6 +43,8 @@ y = np.array([[4.0, 0.1], [3.0, -0.5]])
 report = slam.process(km.Scan(t_s=0.0, robot="rover", sensor="lidar", y=y, ids=[7, -1]))
 for one in report.observations:
     print(one.id, one.outcome, one.landmark, one.reason)
+km.draw(slam, report=report, labels=True).figure.legend(loc="outside lower center", ncols=2)
+plt.show()
 
 # %%
 # Try changing

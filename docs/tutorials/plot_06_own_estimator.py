@@ -12,6 +12,8 @@ An estimator predicts and corrects the map, [S] (14)-(30). The simplest ones cha
 # ``update`` has the scan: observation model, slots of the landmarks, measurements ``y`` and their noise ``R``.
 from typing import Annotated, ClassVar
 
+import matplotlib.pyplot as plt
+
 import kalmark as km
 from kalmark.config import build_slam
 from kalmark.declare import Positive
@@ -49,11 +51,19 @@ class WithMoreNoise:
 # small.
 world = load_world("random_field", ["steps=150"])
 log = simulate(world, seed=2)
+figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3), layout="constrained", sharey=True)
 for estimator in (km.estimators.Invariant(), km.estimators.Ekf(), km.textbook.Textbook(), WithMoreNoise(factor=4.0)):
     run = km.record(build_slam(world.config(), log, estimator=estimator), log, progress=False)
     told = run.evaluate()
     print(f"{type(estimator).__name__:14} pose NEES {told['robots']['rover']['pose_nees']:.2f}", end=", ")
     print(f"NIS per degree of freedom {told['nis_per_dof']:.2f}")
+    left.barh(type(estimator).__name__, told["robots"]["rover"]["pose_nees"])
+    right.barh(type(estimator).__name__, told["nis_per_dof"])
+left.axvline(3, color="0.4")
+left.set(xlabel="pose NEES, 3 expected")
+right.axvline(1, color="0.4")
+right.set(xlabel="NIS per degree of freedom, 1 expected")
+plt.show()
 
 # %%
 # Try changing

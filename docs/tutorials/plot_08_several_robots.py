@@ -10,6 +10,7 @@ Robots share one map: each has a name, in every event, and the covariance has al
 # ---------------------
 #
 # Only ``alpha`` knows where it starts. ``beta`` is somewhere within two metres.
+import matplotlib.pyplot as plt
 import numpy as np
 
 import kalmark as km
@@ -30,24 +31,35 @@ def sigmas(name):
     return np.sqrt(np.diag(slam.covariance(name))).round(3)
 
 
+def ellipse(name):
+    return km.geometry.ellipse(slam.mean(name)[:2], slam.covariance(name)[:2, :2], sigmas=3, points=40).T
+
+
 # %%
 # A landmark that both see
 # ------------------------
 #
 # ``alpha`` maps the post; ``beta``, truly at (6, 0, pi), sees the same post and is corrected by it.
+figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
+ax.plot(*ellipse("beta"), "0.6", label="beta at first")
 print("beta at first:   ", sigmas("beta"))
 scan("alpha", [0.0, 0.0, 0.0], [[3.0, 1.0]], ["post"])
 scan("beta", [6.0, 0.0, np.pi], [[3.0, 1.0]], ["post"])
 print("by the post:     ", sigmas("beta"))
+ax.plot(*ellipse("beta"), "C3", label="beta by the post")
 
 # %%
 # Robots that see each other
 # --------------------------
 #
 # The id of an observation may be the name of a robot. Then both are corrected, and all that is correlated with them.
-scan("alpha", [0.0, 0.0, 0.0], [[6.0, 0.0]], ["beta"])
+report = scan("alpha", [0.0, 0.0, 0.0], [[6.0, 0.0]], ["beta"])
 print("seen by alpha:   ", sigmas("beta"), "at", slam.mean("beta").round(2))
 print("joint covariance of both robots and the post:", slam.covariance("alpha", "beta", "post").shape)
+figure.legend(loc="outside right upper")
+km.draw(slam, ax, report=report, labels=True)
+ax.set(xlim=(-1, 12), ylim=(-6, 7))
+plt.show()
 
 # %%
 # In a log

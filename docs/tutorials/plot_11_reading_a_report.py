@@ -9,6 +9,7 @@ and the reason.
 # %%
 # Three outcomes
 # --------------
+import matplotlib.pyplot as plt
 import numpy as np
 
 import kalmark as km
@@ -25,6 +26,8 @@ scan(0.0, [[4.0, 0.3], [2.0, -0.5]], [7, 8])
 report = scan(0.1, [[4.1, 0.31], [3.5, -0.5], [6.0, 0.0]], [7, 8, 9])
 for one in report.observations:
     print(f"{one.index}: {one.outcome} to {one.landmark}, d2 {one.d2}, {one.reason}")
+km.draw(slam, report=report, labels=True).figure.legend(loc="outside lower center", ncols=2)
+plt.show()
 
 # %%
 # ``associated``: it corrected the map. ``rejected``: it is outside the gate, here the second one, 1.5 m off. ``new``:

@@ -11,6 +11,8 @@ stays as it was: it is never fused silently at the wrong time.
 # ---------------
 import heapq
 
+import matplotlib.pyplot as plt
+
 import kalmark as km
 from kalmark.errors import EventError
 from kalmark.events import sort_key
@@ -32,13 +34,14 @@ except EventError as error:
 # happened since is a prediction, which costs little.
 class Buffer:
     def __init__(self, slam, delay_s):
-        self.slam, self.delay_s, self.waiting = slam, delay_s, []
+        self.slam, self.delay_s, self.waiting, self.processed = slam, delay_s, [], []
 
     def add(self, event):
         heapq.heappush(self.waiting, (sort_key(event), id(event), event))
         now_ns = max(one[-1].t_ns for one in self.waiting)
         while self.waiting and now_ns - self.waiting[0][-1].t_ns >= self.delay_s * 1e9:
             self.slam.process(heapq.heappop(self.waiting)[-1])
+        self.processed.append((now_ns / 1e9, event.t_ns / 1e9, self.slam.t_ns / 1e9))
 
 
 buffer = Buffer(slam, delay_s=0.3)
@@ -48,6 +51,13 @@ for k in range(20):
     if k >= 2:  # a camera whose images take 0.2 s
         buffer.add(km.Scan(t_s=t - 0.2, robot="rover", sensor="lidar", y=[[4.0 - 0.05 * k, 0.1]], ids=[7]))
 print(f"processed up to {slam.t_ns / 1e9:.1f} s of {t:.1f} s, {len(buffer.waiting)} events wait")
+now, stamps, until = zip(*buffer.processed, strict=True)
+figure, ax = plt.subplots(figsize=(7, 3.5), layout="constrained")
+ax.plot(now, stamps, ".", label="events, as they arrive")
+ax.plot(now, until, label="processed up to here")
+ax.set(xlabel="time [s]", ylabel="time of the event [s]")
+ax.legend()
+plt.show()
 
 # %%
 # A recorded log

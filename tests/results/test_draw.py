@@ -12,7 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 from PIL import Image
 
@@ -21,6 +23,7 @@ from kalmark.logs.log import Log, Trajectory
 from kalmark.report import Report
 from kalmark.results.filter_description import KEPT, correlations_kept
 from kalmark.results.history import WHOLE
+from kalmark.results.labels import name_points
 from kalmark.results.plot import draw_map, save_map
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
@@ -188,11 +191,11 @@ def test_the_view_from_behind_the_robot_has_ahead_what_it_looks_at() -> None:
     for name, place in {"ahead": (0.0, 6.0, 1.0), "left": (-2.0, 4.0, 1.0), "behind": (0.0, -9.0, 1.0)}.items():
         slam.add_landmark(name, place, 0.01 * np.eye(3))
     axes = km.draw(slam, view="self", ellipses="off", labels=True)
-    at = dict(zip(texts(axes), (text.get_position() for text in axes.texts), strict=True))
+    at = dict(zip(texts(axes), (text.xy for text in axes.texts), strict=True))
     assert abs(at["ahead"][0]) < 1e-9
     assert at["ahead"][1] > 0
     assert at["left"][0] < 0
-    assert np.isnan(at["behind"][0])
+    assert "behind" not in at
 
 
 def test_a_path_or_a_truth_of_another_shape_is_refused_in_one_line() -> None:
@@ -323,3 +326,18 @@ def test_a_map_that_is_kept_has_the_correlations_of_its_numbers_unless_it_is_lar
     red, _, blue = picture.convert("RGB").getpixel((0, 0))  # type: ignore[misc]
     assert red > 2 * blue, "a correlation of 1 is red"
     assert correlations_kept(slam, [*last.ids] * (KEPT + 1)).size == 0
+
+
+@pytest.mark.parametrize("space", [False, True])
+def test_names_of_points_that_are_close_do_not_meet(space: bool) -> None:
+    figure = Figure(figsize=(4, 3))
+    axes = figure.add_subplot(projection="3d" if space else None)
+    points = np.array([[0.5, 0.5], [0.5, 0.56], [0.56, 0.5], [0.9, 0.9], [0.95, 0.9]])
+    name_points(axes, np.pad(points, ((0, 0), (0, 1))) if space else points, ["one", "two", "three", "four", "five"])
+    for width in (4.0, 8.0):
+        figure.set_size_inches(width, 3.0)
+        FigureCanvasAgg(figure).draw()
+        boxes = [text.get_window_extent() for text in axes.texts]
+        assert not any(a.overlaps(b) for k, a in enumerate(boxes) for b in boxes[:k])
+        marks = axes.transData.transform([text.xy for text in axes.texts])
+        assert not any(box.contains(*mark) for box in boxes for mark in marks)

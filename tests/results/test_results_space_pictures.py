@@ -143,8 +143,8 @@ def test_the_image_shows_what_was_used_and_what_was_rejected(run: Run) -> None:
     assert axes.get_ylim() == (480.0, 0.0)
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert labels == ["measured", "Euclidean, used, 3σ", "Euclidean, predicted only, 3σ", "rejected"]
-    names = {text.get_text(): text.get_position() for text in axes.texts}
-    assert names[str(WRONG)][1] == pytest.approx(by_name[str(WRONG)].expected[0, 1] - 15)
+    names = {text.get_text(): text.xy for text in axes.texts}
+    assert names[str(WRONG)][1] == pytest.approx(by_name[str(WRONG)].expected[0, 1])
 
 
 def test_a_scan_is_chosen_by_its_time_since_the_first(run: Run) -> None:

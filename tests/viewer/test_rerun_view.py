@@ -56,7 +56,7 @@ def test_the_file_has_robots_map_scan_and_figures_of_each_step(files: tuple[Run,
     np.testing.assert_allclose(places[:, :2], history.poses[:, :2], atol=1e-5)
     true = np.array(rows[f"/map/true_robots/{robot}"]["Transform3D:translation"]).reshape(-1, 3)
     np.testing.assert_allclose(true[:, :2], run.truth.poses_in_map()[:, :2], atol=1e-5)
-    sigmas = np.array(rows[f"/sigma/{robot}"]["Scalars:scalars"])
+    sigmas = np.hstack([rows[f"/sigma/{robot}/{part}"]["Scalars:scalars"] for part in ("position", "rotation")])
     np.testing.assert_allclose(
         sigmas**2, np.diagonal(history.pose_covariances, axis1=1, axis2=2), rtol=1e-6, atol=1e-15
     )

@@ -11,10 +11,10 @@ and one ``SenFig`` for each sensor, in its measurement space. In kalmark ``kalma
 # A run up to its last frame
 # --------------------------
 import matplotlib.pyplot as plt
-import numpy as np
 
 import kalmark as km
 from kalmark.config import build_slam
+from kalmark.results.labels import name_points
 from kalmark.simulate import load_world, simulate
 
 world = load_world("thick_cloister_pinhole", ["steps=60"])
@@ -32,13 +32,9 @@ seen = slam.expect("robot", "camera", in_view=True)
 # ellipses of 3 sigma, made four times as large to be seen; names are beside them.
 figure, image = plt.subplots(figsize=(7, 5.2), layout="constrained")
 image.plot(*log.events[-1].y.T, "k+")
-around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-around, taken = 24 * np.transpose([np.cos(around), np.sin(around)]), seen.e.copy()
-for e, name, Z in zip(seen.e, seen.names, seen.Z, strict=True):
+for e, Z in zip(seen.e, seen.Z, strict=True):
     image.plot(*km.geometry.ellipse(e, Z, sigmas=12, points=30).T, "C0", lw=1)
-    room = np.linalg.norm(e + around[:, None] - taken, axis=2).min(axis=1)
-    taken = np.vstack([taken, e + around[room.argmax()]])  # of the places about it the one with most room
-    image.annotate(name, taken[-1], color="C0", size="small", ha="center", va="center")
+name_points(image, seen.e, seen.names, gap=10, color="C0", size="small")
 image.set(xlim=(0, 640), ylim=(480, 0), aspect="equal", xlabel="u [px]", ylabel="v [px]")
 
 # %%

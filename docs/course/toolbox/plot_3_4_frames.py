@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import kalmark as km
+from kalmark.results.labels import name_points
 
 frames, rotations = km.geometry.frames3d, km.geometry.rotations
 robot, _ = frames.from_euler_pose(np.array([2.0, 1.0, 0.0, 0.0, 0.0, np.pi / 6]))
@@ -42,13 +43,11 @@ print("column of PW_f", PW_f[:, 5].round(4), " by differences", rate.round(4))
 #
 # Axes x, y, z are red, green, blue, drawn 0.6 m long. The columns of :math:`R` are the axes of the camera in the world.
 ax = plt.figure(figsize=(8, 5.5)).add_subplot(projection="3d")
-for name, pose in {"W": np.eye(7)[6], "robot": robot, "camera": camera}.items():
+for pose in (np.eye(7)[6], robot, camera):
     for axis, colour in zip(rotations.matrix(pose[3:]).T, ("C3", "C2", "C0"), strict=True):
         ax.quiver(*pose[:3], *axis, color=colour, length=0.6)
-    up, side = (0.15, "left") if name == "camera" else (-0.2, "right")
-    ax.text(*pose[:2], pose[2] + up, name, ha=side)
 ax.plot(*np.array([camera[:3], p_world]).T, "k:o", ms=3)
-ax.text(*p_world, "  p")
+name_points(ax, [np.zeros(3), robot[:3], camera[:3], p_world], ["W", "robot", "camera", "p"], gap=8)
 ax.set(xlim=(0, 5), ylim=(-0.5, 3), zlim=(0, 1.8), zticks=[0, 1], xlabel="x [m]", ylabel="y [m]")
 ax.set(aspect="equal")
 ax.view_init(40, -75)

@@ -24,6 +24,7 @@ from kalmark.errors import KalmarkError
 from kalmark.files import replace_file
 from kalmark.geometry.rotations import matrix
 from kalmark.results.evaluate import headline, summary_of
+from kalmark.results.labels import name_points
 from kalmark.results.landmark_table import LINES, TAG
 from kalmark.results.recording import Recording
 from kalmark.results.scene import (
@@ -62,7 +63,7 @@ WINDOW = 0.7  # half of the picture from behind a robot, by the distance of the 
 NEAREST = 0.1  # what is nearer to the eye than this part of the distance of the middle is not drawn
 FEW = 40  # landmarks of space that are labelled
 GROUND, SHADOW, TICK, SOFT = "#d7dbe1", "#c3c8d0", "#7a818c", "#555b66"
-NAMED: dict[str, Any] = {"color": "#1e4d2b", "fontsize": 7, "ha": "center", "va": "bottom", "zorder": 9}
+NAMED: dict[str, Any] = {"color": "#1e4d2b", "fontsize": 7, "zorder": 9}
 POSE_COLOUR = "#d62f2f"
 ALARM_COLOUR = "#b3261e"
 KNOWN_COLOUR = "#2f7d4f"
@@ -178,8 +179,8 @@ def draw_plan(axes: Axes, scene: Scene) -> None:
     style_axes(axes, "x (m)", "y (m)")
     for stroke in strokes(scene):
         axes.plot(stroke.points[:, 0], stroke.points[:, 1], label=stroke.label or None, **stroke.style)
-    for name, point in _labels(scene):
-        axes.text(point[0], point[1] + 0.01 * scene.size, name, **NAMED)
+    names, places = _labels(scene)
+    name_points(axes, places, names, **NAMED)
     axes.set_xlim(scene.low[0], scene.high[0])
     axes.set_ylim(scene.low[1], scene.high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -344,14 +345,13 @@ def legend(scene: Scene) -> list[Line2D]:
     return [Line2D([], [], label=label, **(sample or {})) for label, sample in reversed(samples.items())]
 
 
-def _labels(scene: Scene) -> list[tuple[str, Array]]:
+def _labels(scene: Scene) -> tuple[list[str], Array]:
     """Return the names of the landmarks and their places; by default those of space, if they are few."""
     usual = scene.d == 3 and len(scene.ids) <= FEW
-    if not (usual if scene.picture.labels is None else scene.picture.labels):
-        return []
     places = scene.shapes.means[: len(scene.ids)]
     inside = ((places >= scene.low) & (places <= scene.high)).all(axis=1)
-    return [(str(scene.ids[k]), places[k]) for k in np.flatnonzero(inside).tolist()]
+    named = np.flatnonzero(inside & (usual if scene.picture.labels is None else scene.picture.labels))
+    return [str(scene.ids[k]) for k in named.tolist()], places[named]
 
 
 @dataclass(frozen=True, eq=False)
@@ -418,9 +418,8 @@ def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
             axes.plot(*projection(points).T, clip_on=False, **style)
     for points, style, label, _ in strokes(scene):
         axes.plot(*projection(scene.inside(points)).T, clip_on=False, label=label or None, **style)
-    for name, point in _labels(scene):
-        u, v = projection(point)
-        axes.text(u, v + 0.012 * scene.size, name, **NAMED)
+    names, places = _labels(scene)
+    name_points(axes, projection(places), names, **NAMED)
     low, high = projection.frame(scene.low, scene.high)
     pad = 0.0 if flat else 0.04 * (high - low).max()
     axes.set_xlim(low[0] - pad, high[0] + pad)

@@ -19,6 +19,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.geometry.gaussian import ellipses
 from kalmark.picture_options import Picture
 from kalmark.results.history import History, Measuring
+from kalmark.results.labels import name_points
 from kalmark.results.scene import IN_VIEW, INK
 
 ACROSS = ("bearing_rad", "azimuth_rad", "y_m")  # columns to be drawn from right to left, the first that there is,
@@ -81,8 +82,7 @@ def draw_measured(history: History, sensor: Measuring, step: int, options: Pictu
     e_m, Z_m = _expected(history.unmeasured_e[missed], history.unmeasured_Z[missed], columns, scale)
     _draw(axes, e_m, Z_m, unmeasured, ":")
     names = [*history.landmark[rows].tolist(), *history.unmeasured_landmark[missed].tolist()]
-    for at, name in zip([*y, *e_m], names, strict=True):
-        axes.annotate(name, at, (5, 5), textcoords="offset points", fontsize=8, color=INK)
+    name_points(axes, np.vstack([y, e_m]), names, fontsize=8, color=INK)
     axes.set_xlabel(found[0].label)
     axes.set_ylabel(found[1].label)
     if not in_map:

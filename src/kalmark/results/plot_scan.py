@@ -21,6 +21,7 @@ from kalmark.results.camera_images import Pictures
 from kalmark.results.explain import Explanation, Fate
 from kalmark.results.figure_texts import figure as figure_of
 from kalmark.results.history import Camera, Measuring
+from kalmark.results.labels import name_points
 from kalmark.results.plot_measured import draw_measured, sensors_with_picture
 from kalmark.results.recording import Recording
 from kalmark.results.scene import (
@@ -262,9 +263,7 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, optio
         _draw_expected(axes, s, size, colour, rejected)
     if named and s.outcome != "ignored" and s.name:
         at = s.expected.mean(axis=0) if expected and (single or not len(s.measured)) else s.measured.mean(axis=0)
-        text: dict[str, Any] = {"va": "bottom", "fontsize": 7, "color": NAME, "clip_on": True}
-        within = "left" if at[0] < 0.02 * size[0] else "right" if at[0] > 0.98 * size[0] else "center"
-        axes.text(at[0], at[1] - 15.0, s.name, zorder=7, ha=within, **text)
+        name_points(axes, at[None], [s.name], zorder=7, fontsize=7, color=NAME)
 
 
 def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: str, rejected: bool) -> None:

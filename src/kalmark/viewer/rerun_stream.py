@@ -44,8 +44,10 @@ PATIENCE_S = 3.0  # after which a viewer has opened its window, or has ended
 SHAPE = 0.625  # height of a window as a part of its width
 SPIN = 0.2  # of the eye in an orbit
 QUALITY = 75  # of an image, compressed as JPEG
+BOUND = "#9a9a9a"  # of what a figure of consistency is compared with
+PIECE = 0.005  # of the size of the map: the least length of a piece of a path
 MARK, LINE, BEAM = -2.5, -1.2, -0.5  # radii; negative ones are points of the screen
-POSES = {3: ("x (m)", "y (m)", "heading (rad)"), 6: ("x (m)", "y (m)", "z (m)", "about x", "about y", "about z (rad)")}
+AXES = {"x": "#ff7f7f", "y": "#8fd18f", "z": "#8fb4ff"}  # of the world, and of rotations about them
 
 
 class Stream:
@@ -58,7 +60,7 @@ class Stream:
             raise PluginError(INSTALL) from None
         self.rr: Any = rerun
         self.recording = rerun.RecordingStream("kalmark", recording_id=name or None)
-        self.path, self.d, self.last = path, scene.d, dict[str, Array]()
+        self.path, self.d, self.size, self.last = path, scene.d, scene.size, dict[str, Array]()
         self.picture, self.colours = scene.picture, {robot: scene.colour(robot) for robot in scene.paths}
         if path is None:
             self.recording.connect_grpc(start_viewer(scene.picture.width_px))
@@ -82,13 +84,18 @@ class Stream:
         self.put("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for robot in scene.paths:
             colour, lines = scene.colour(robot), scene.body(robot)
-            self.put(f"map/robots/{robot}/body", rr.LineStrips3D(lines, colors=rgb(colour), radii=LINE), static=True)
+            body = rr.LineStrips3D(lines, colors=rgb(colour), radii=LINE)
+            self.put(f"map/robots/{robot}/body", body, static=True)
+            if len(scene.paths) > 1:
+                name = rr.Points3D([[0.0, 0.0, 0.0]], colors=rgb(colour), labels=[robot], show_labels=True, radii=LINE)
+                self.put(f"map/robots/{robot}/name", name, static=True)
             if scene.picture.truth:
                 self.put(f"map/true_robots/{robot}/body", rr.LineStrips3D(lines, colors=true, radii=LINE), static=True)
-            names = POSES[3 if scene.d == 2 else 6]
-            self.put(f"sigma/{robot}", rr.SeriesLines(names=list(names)), static=True)
-            self.put(f"consistency/NEES/{robot}", rr.SeriesLines(names=["NEES", "95 % from", "to"]), static=True)
-        self.put("consistency/NIS", rr.SeriesLines(names=["NIS per degree of freedom"]), static=True)
+            place, turn = [*AXES][: self.d], ["z"] if self.d == 2 else [*AXES]
+            self._curves(f"sigma/{robot}/position", {name: AXES[name] for name in place})
+            self._curves(f"sigma/{robot}/rotation", {f"about {name}": AXES[name] for name in turn})
+            self._curves(f"consistency/NEES/{robot}", {robot: colour, "from": BOUND, "to": BOUND})
+        self._curves("consistency/NIS", {"NIS": AXES["y"], "expected": BOUND})
         places = [l[:2] if self.d == 2 else l[:3] for l in scene.true_points().values()]
         if scene.picture.truth and places:
             points = rr.Points3D(xyz(np.array(places)), colors=true, radii=MARK)
@@ -96,6 +103,11 @@ class Stream:
         if scene.picture.truth and scene.true_lines():
             self.put("map/true_lines", rr.LineStrips3D([*map(xyz, scene.true_lines())], colors=true), static=True)
         self.recording.send_blueprint(self._arranged(scene))
+
+    def _curves(self, entity: str, colours: dict[str, str]) -> None:
+        """Log names and colours of the curves of an entity."""
+        lines = self.rr.SeriesLines(names=[*colours], colors=[rgb(colour) for colour in colours.values()])
+        self.put(entity, lines, static=True)
 
     def _arranged(self, scene: Scene) -> Any:
         import rerun.blueprint as rrb
@@ -125,12 +137,26 @@ class Stream:
             tracking_entity=f"map/robots/{first}/behind" if behind else None,
         )
         three = rrb.Spatial3DView(origin="map", name="map", overrides=dict.fromkeys(paths, forever), eye_controls=look)
-        figures = [
-            rrb.TimeSeriesView(origin="consistency/NEES", name="NEES of the pose"),
-            rrb.TimeSeriesView(origin="consistency/NIS", name="NIS"),
-            rrb.TimeSeriesView(origin="sigma", name="sigmas"),
-            rrb.Spatial2DView(origin="covariance", name="correlations of P"),
+
+        def curves(origin: str, name: str, named: bool) -> Any:
+            shown = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=named)
+            return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=shown)
+
+        turn = f"{'sigma of the heading' if self.d == 2 else 'sigmas of the rotation'} (rad)"
+        sigmas = [
+            rrb.Vertical(
+                curves(f"sigma/{robot}/position", "sigmas of the position (m)", True),
+                curves(f"sigma/{robot}/rotation", turn, False),
+                name=robot,
+            )
+            for robot in scene.paths
         ]
+        figures = [
+            curves("consistency/NEES", "NEES of the pose and its 95 % band", False),
+            curves("consistency/NIS", "NIS per degree of freedom, 1 expected", False),
+            rrb.Tabs(*sigmas) if len(sigmas) > 1 else sigmas[0],
+        ]
+        correlations = rrb.Spatial2DView(origin="covariance", name="correlations of P")
         views = [
             rrb.Spatial2DView(
                 origin="/".join(filter(None, ["images", c.robot, c.sensor, side])),
@@ -140,8 +166,11 @@ class Stream:
             for c in scene.cameras
             for side in sides_of(c)
         ]
-        beside = rrb.Vertical(*figures)
-        left = rrb.Vertical(three, rrb.Horizontal(*views), row_shares=[2, 1]) if views else three
+        if views:
+            left = rrb.Vertical(three, rrb.Horizontal(*views, correlations), row_shares=[2, 1])
+        else:
+            left, figures = three, [*figures, correlations]
+        beside = rrb.Vertical(*figures, row_shares=[1, 1, 2, 2][: len(figures)])
         return rrb.Blueprint(rrb.Horizontal(left, beside, column_shares=[2, 1]), collapse_panels=True)
 
     def robot(self, name: str, pose: Array, P: Array, true: Array, nees: float) -> None:
@@ -151,7 +180,9 @@ class Stream:
         if self.picture.ellipses != "off":
             ellipsoid = self._ellipsoids(pose[None, : self.d], P[None, : self.d, : self.d], rgb(colour))
             self.put(f"map/robot_ellipses/{name}", ellipsoid)
-        self.put(f"sigma/{name}", rr.Scalars(np.sqrt(np.maximum(np.diagonal(P), 0.0))))
+        sigma = np.sqrt(np.maximum(np.diagonal(P), 0.0))
+        self.put(f"sigma/{name}/position", rr.Scalars(sigma[: self.d]))
+        self.put(f"sigma/{name}/rotation", rr.Scalars(sigma[self.d :]))
         if np.isfinite(true).all() and self.picture.truth:
             colour = self.picture.colour("truth", TRUTH_COLOUR)
             self._move(f"map/true_robots/{name}", f"map/true_paths/{name}", true, colour)
@@ -161,9 +192,10 @@ class Stream:
     def _move(self, entity: str, path: str, pose: Array, colour: str) -> None:
         whole = poses_of_size(pose[None], 7)[0]
         self.put(entity, self.rr.Transform3D(translation=whole[:3], quaternion=whole[3:7]))
-        before = self.last.get(entity, whole)
-        self.put(path, self.rr.LineStrips3D([[before[:3], whole[:3]]], colors=rgb(colour), radii=LINE))
-        self.last[entity] = whole
+        before = self.last.setdefault(entity, whole)
+        if np.linalg.norm(whole[:3] - before[:3]) > PIECE * self.size:
+            self.put(path, self.rr.LineStrips3D([[before[:3], whole[:3]]], colors=rgb(colour), radii=LINE))
+            self.last[entity] = whole
 
     def landmarks(self, scene: Scene) -> None:
         """Log the landmarks of a map: points, ellipsoids, lines and tags, by their groups."""
@@ -263,7 +295,7 @@ class Stream:
     def nis(self, value: float, dof: int) -> None:
         """Log the NIS of the observations of a scan, divided by its degrees of freedom."""
         if dof:
-            self.put("consistency/NIS", self.rr.Scalars([value / dof]))
+            self.put("consistency/NIS", self.rr.Scalars([value / dof, 1.0]))
 
     def flush(self) -> None:
         """Send all that is still here."""
