@@ -59,6 +59,8 @@ def _joined(done: list[Correction]) -> Correction:
 class _Estimator:
     """Runs the compiled correction for built-in models and the same source in Python for a user's."""
 
+    coordinates: ClassVar[str] = "world"
+    default_gate: ClassVar[float] = math.inf
     source: ClassVar[Callable[..., Any]]
     compiled: ClassVar[Callable[..., Any]]
     option: ClassVar[str] = "none"  # the type of what `_option` returns
@@ -159,8 +161,7 @@ class Ekf(_Estimator):
     'new'
     """
 
-    coordinates: ClassVar[str] = "world"
-    default_gate: ClassVar[float] = 9.0
+    default_gate = 9.0
     source = corrections.textbook
     compiled = corrections.compiled_textbook
 
@@ -183,10 +184,9 @@ class Invariant(_Estimator):
     iterations: Annotated[Count, "At most this many linearisations of a scan."] = 30
     tolerance: Annotated[Positive, "No more once nothing moves by more than this many of its sigmas."] = 1e-3
 
-    coordinates: ClassVar[str] = "log"
-    option: ClassVar[str] = "Tuple((i8, f8))"
-    transports: ClassVar[bool] = True
-    default_gate: ClassVar[float] = math.inf
+    coordinates = "log"
+    option = "Tuple((i8, f8))"
+    transports = True
     source = corrections.invariant
     compiled = corrections.compiled_invariant
 
@@ -217,10 +217,8 @@ class Fej(_Estimator):
     'new'
     """
 
-    coordinates: ClassVar[str] = "world"
-    option: ClassVar[str] = "f8[::1]"
-    from_first: ClassVar[bool] = True
-    default_gate: ClassVar[float] = math.inf
+    option = "f8[::1]"
+    from_first = True
     source = corrections.first_estimates
     compiled = corrections.compiled_first_estimates
 

@@ -7,7 +7,7 @@ turn); robot_localization's omnidirectional model has the same state.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -91,14 +91,14 @@ class ConstantVelocity(MotionModel, CompiledVelocity):
     sigma_vy_mps_per_sqrt_s: Annotated[NotNegative, "Random walk of the velocity to the left, all the time."] = 0.1
     sigma_w_radps_per_sqrt_s: Annotated[NotNegative, "Random walk of the turn rate, all the time."] = 0.1
 
-    space: ClassVar[Space] = Space("SE2 with velocity", (VECTOR, HEADING, SCALAR, SCALAR, SCALAR))
-    columns: ClassVar[tuple[str, ...]] = ("dvx_mps", "dvy_mps", "dw_radps")
-    held: ClassVar[bool] = False
-    moves: ClassVar[Any] = coast_in_plane
-    velocity: ClassVar[Any] = velocity_of_plane
-    coasts: ClassVar[bool] = True
-    state_columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "w_radps")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_v_mps", "sigma_w_radps")
+    space = Space("SE2 with velocity", (VECTOR, HEADING, SCALAR, SCALAR, SCALAR))
+    columns = ("dvx_mps", "dvy_mps", "dw_radps")
+    held = False
+    moves = coast_in_plane
+    velocity = velocity_of_plane
+    coasts = True
+    state_columns = ("vx_mps", "vy_mps", "w_radps")
+    sigmas = ("sigma_v_mps", "sigma_v_mps", "sigma_w_radps")
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
         """Return the covariance (6, 6) gathered in `dt_s` at rest."""
@@ -132,14 +132,14 @@ class ConstantTurnRate(MotionModel, CompiledVelocity):
     sigma_v_mps_per_sqrt_s: Annotated[NotNegative, "Random walk of the speed, all the time."] = 0.1
     sigma_w_radps_per_sqrt_s: Annotated[NotNegative, "Random walk of the turn rate, all the time."] = 0.1
 
-    space: ClassVar[Space] = Space("SE2 with speed", (VECTOR, HEADING, SCALAR, SCALAR))
-    columns: ClassVar[tuple[str, ...]] = ("dv_mps", "dw_radps")
-    held: ClassVar[bool] = False
-    moves: ClassVar[Any] = coast_ahead
-    velocity: ClassVar[Any] = velocity_ahead
-    coasts: ClassVar[bool] = True
-    state_columns: ClassVar[tuple[str, ...]] = ("vx_mps", "w_radps")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_w_radps")
+    space = Space("SE2 with speed", (VECTOR, HEADING, SCALAR, SCALAR))
+    columns = ("dv_mps", "dw_radps")
+    held = False
+    moves = coast_ahead
+    velocity = velocity_ahead
+    coasts = True
+    state_columns = ("vx_mps", "w_radps")
+    sigmas = ("sigma_v_mps", "sigma_w_radps")
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
         """Return the covariance (5, 5) gathered in `dt_s` at rest."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 
@@ -63,7 +63,7 @@ class _Doppler(Expecting):
     world: ClassVar[str]
     columns: ClassVar[tuple[str, ...]] = ("range_rate_mps",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_rate_mps",)
-    expected: ClassVar[Any] = expect_range_rate
+    expected = expect_range_rate
     additive: ClassVar[bool] = True
     sees_velocity: ClassVar[bool] = True
 
@@ -89,8 +89,8 @@ class RangeRate2D(_Doppler):
     array([[-0.8]])
     """
 
-    world: ClassVar[str] = "plane"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
+    world = "plane"
+    sees_kinds = ("point",)
 
 
 @register("sensor", "range_rate")
@@ -108,8 +108,8 @@ class RangeRate3D(_Doppler):
     array([[-0.8]])
     """
 
-    world: ClassVar[str] = "space"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+    world = "space"
+    sees_kinds = ("point3",)
 
 
 @register("sensor", "radar")
@@ -129,10 +129,10 @@ class Radar2D(_Doppler):
     sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
     sigma_bearing_rad: Annotated[Positive, "Noise of the bearing."] = 0.02
 
-    world: ClassVar[str] = "plane"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point",)
-    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "range_rate_mps")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad", "sigma_rate_mps")
+    world = "plane"
+    sees_kinds = ("point",)
+    columns = ("range_m", "bearing_rad", "range_rate_mps")
+    sigmas = ("sigma_range_m", "sigma_bearing_rad", "sigma_rate_mps")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return points (K, 2) and V_y (K, 2, 3), zero for the rate.  [S] (62)."""
@@ -163,10 +163,10 @@ class Radar3D(_Doppler):
     sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
     sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
 
-    world: ClassVar[str] = "space"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
-    columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad", "range_rate_mps")
-    sigmas: ClassVar[tuple[str, ...]] = (
+    world = "space"
+    sees_kinds = ("point3",)
+    columns = ("range_m", "azimuth_rad", "elevation_rad", "range_rate_mps")
+    sigmas = (
         "sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad", "sigma_rate_mps",
     )  # fmt: skip
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -33,9 +33,9 @@ class _Camera(Spatial):
 
     columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px")
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_px",) * 2
-    expected: ClassVar[Any] = landmark_views.camera
+    expected = landmark_views.camera
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3", "inverse_depth", "anchored_homogeneous", "homogeneous")
-    finds_depth: ClassVar[bool] = False
+    finds_depth = False
 
     width_px: float
     height_px: float
@@ -142,10 +142,10 @@ class PixelDepth(_Lens):
 
     sigma_rho_per_m: Annotated[Positive, "Noise of the inverse depth: that of a depth z is sigma_rho z^2."] = 0.003
 
-    expected: ClassVar[Any] = landmark_views.pixel_depth
-    columns: ClassVar[tuple[str, ...]] = ("u_px", "v_px", "rho_per_m")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_px", "sigma_px", "sigma_rho_per_m")
-    finds_depth: ClassVar[bool] = True
+    expected = landmark_views.pixel_depth
+    columns = ("u_px", "v_px", "rho_per_m")
+    sigmas = ("sigma_px", "sigma_px", "sigma_rho_per_m")
+    finds_depth = True
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return unit rays with their inverse distances (K, 4) of y (K, 3), and their Jacobian (K, 4, 3)."""
@@ -224,11 +224,11 @@ class Stereo(_PinHole):
     sigma_ur_px: Annotated[Positive, "Noise of the right u."] = 1.0
     sigma_vr_px: Annotated[Positive, "Noise of the right v."] = 1.0
 
-    expected: ClassVar[Any] = landmark_views.stereo
+    expected = landmark_views.stereo
     of_pair: ClassVar[bool] = True
-    columns: ClassVar[tuple[str, ...]] = ("ul_px", "vl_px", "ur_px", "vr_px")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_ul_px", "sigma_vl_px", "sigma_ur_px", "sigma_vr_px")
-    finds_depth: ClassVar[bool] = True
+    columns = ("ul_px", "vl_px", "ur_px", "vr_px")
+    sigmas = ("sigma_ul_px", "sigma_vl_px", "sigma_ur_px", "sigma_vr_px")
+    finds_depth = True
 
     @cached_property
     def parameters(self) -> Array:
@@ -273,9 +273,9 @@ class Segments(_PinHole):
     sigma_px: Annotated[Positive, "Noise of each pixel coordinate of an end."] = 1.0
     min_length_px: Annotated[NotNegative, "Shortest segment that counts as seen."] = 20.0
 
-    expected: ClassVar[Any] = landmark_views.segment
-    columns: ClassVar[tuple[str, ...]] = ("u1_px", "v1_px", "u2_px", "v2_px")
-    sees_kinds: ClassVar[tuple[str, ...]] = (
+    expected = landmark_views.segment
+    columns = ("u1_px", "v1_px", "u2_px", "v2_px")
+    sees_kinds = (
         "pluecker_line", "anchored_pluecker_line", "inverse_depth_line", "anchored_homogeneous_line",
         "homogeneous_line",
     )  # fmt: skip
@@ -327,14 +327,14 @@ class TagCorners(_Lens):
     array([4., 0., 0.])
     """
 
-    expected: ClassVar[Any] = landmark_views.tag_corners
-    cov_size: ClassVar[int] = 8
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_px",) * 8
-    columns: ClassVar[tuple[str, ...]] = (
+    expected = landmark_views.tag_corners
+    cov_size = 8
+    sigmas = ("sigma_px",) * 8
+    columns = (
         "u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m",
     )  # fmt: skip
-    sees_kinds: ClassVar[tuple[str, ...]] = ("tag",)
-    finds_depth: ClassVar[bool] = True
+    sees_kinds = ("tag",)
+    finds_depth = True
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the tags' poses (K, 7) in the camera, and V_y (K, 6, 8).

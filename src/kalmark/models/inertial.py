@@ -176,16 +176,16 @@ class Inertial(MotionModel):
     accelerometer_random_walk_mps2_per_sqrt_s: Annotated[NotNegative, "Random walk of the force's bias."] = 3.0e-3
     gravity_mps2: Annotated[Positive, "What an accelerometer at rest reads."] = 9.81
 
-    space: ClassVar[Space] = Space("SE2(3) with biases", (VECTOR3, ROTATION, OWN, *(SCALAR,) * 6))
-    columns: ClassVar[tuple[str, ...]] = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
-    held: ClassVar[bool] = True
-    moves: ClassVar[Any] = inertial
+    space = Space("SE2(3) with biases", (VECTOR3, ROTATION, OWN, *(SCALAR,) * 6))
+    columns = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")
+    held = True
+    moves = inertial
     velocity: ClassVar[Any] = inertial_velocity
     state_columns: ClassVar[tuple[str, ...]] = (
         "vx_mps", "vy_mps", "vz_mps", "bias_wx_radps", "bias_wy_radps", "bias_wz_radps",
         "bias_ax_mps2", "bias_ay_mps2", "bias_az_mps2",
     )  # fmt: skip
-    sigmas: ClassVar[tuple[str, ...]] = ()
+    sigmas = ()
 
     @cached_property
     def parameters(self) -> Array:
@@ -236,8 +236,8 @@ class InertialGravity(Inertial):
     (19, (18, 18))
     """
 
-    space: ClassVar[Space] = Space("SE2(3) with biases and gravity", (*Inertial.space.kinds, OWN))
-    state_columns: ClassVar[tuple[str, ...]] = (
+    space = Space("SE2(3) with biases and gravity", (*Inertial.space.kinds, OWN))
+    state_columns = (
         *Inertial.state_columns, "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
     )  # fmt: skip
 

@@ -14,7 +14,7 @@ from kalmark.compiled import compiled
 from kalmark.declare import Estimated, NotNegative, declared
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
-from kalmark.geometry.spaces import SE2, Space
+from kalmark.geometry.spaces import SE2
 from kalmark.models.observe import Compiled
 
 NODES, WEIGHTS = (0.5 * (each + k) for each, k in zip(np.polynomial.legendre.leggauss(5), (1.0, 0.0), strict=True))
@@ -205,7 +205,7 @@ class PlanarMotion(MotionModel):
     sigma_across_m_per_sqrt_s: Annotated[NotNegative, "Random walk across the heading, while it moves."] = 0.0
     sigma_theta_rad_per_sqrt_s: Annotated[NotNegative, "Random walk of the heading, while it moves."] = 0.0
 
-    space: ClassVar[Space] = SE2
+    space = SE2
 
     @cached_property
     def _density(self) -> Array | None:
@@ -229,10 +229,10 @@ class SpeedAndTurn(PlanarMotion):
     sigma_w_scale: TurnScale = 0.0
     sigma_turn_rad_per_m: TurnPerMetre = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
-    held: ClassVar[bool] = True
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_w_radps")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+    columns = ("v_mps", "w_radps")
+    held = True
+    sigmas = ("sigma_v_mps", "sigma_w_radps")
+    calibrations = (
         ("v_mps", "sigma_v_bias_mps"),
         ("w_radps", "sigma_w_bias_radps"),
         ("v_scale", "sigma_v_scale"),
@@ -247,10 +247,10 @@ class SpeedAndTurn(PlanarMotion):
 class Steered(PlanarMotion):
     """Base of a car and a tricycle: the speed of a wheel and a steering angle, each held until the next control."""
 
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
-    held: ClassVar[bool] = True
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_v_mps", "sigma_steering_rad")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+    columns = ("v_mps", "steering_rad")
+    held = True
+    sigmas = ("sigma_v_mps", "sigma_steering_rad")
+    calibrations = (
         ("v_mps", "sigma_v_bias_mps"),
         ("steering_rad", "sigma_steering_bias_rad"),
         ("v_scale", "sigma_v_scale"),

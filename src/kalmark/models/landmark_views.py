@@ -219,6 +219,12 @@ class Sensing:
 
     columns: ClassVar[tuple[str, ...]]
     sigmas: ClassVar[tuple[str, ...]]
+    expected: ClassVar[Any]
+    varied: ClassVar[Any] = None
+    world: ClassVar[str]
+    sees_kinds: ClassVar[tuple[str, ...]]
+    finds_depth: ClassVar[bool]
+    cov_size: ClassVar[int]
 
     @property
     def angular(self) -> tuple[bool, ...]:
@@ -236,8 +242,6 @@ class Sensing:
 
 class Expecting(Sensing):
     """A sensor whose expectation is `expected`, compiled, of the form `seen.EXPECT`."""
-
-    expected: ClassVar[Any]
 
     @property
     def code(self) -> int:
@@ -268,7 +272,7 @@ class Expecting(Sensing):
 class Spatial(Expecting):
     """Base of sensors of space, and of walls."""
 
-    world: ClassVar[str] = "space"
+    world = "space"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
     additive: ClassVar[bool] = True
 
@@ -322,8 +326,8 @@ class Raised(Distancing):
     _: KW_ONLY
     height_m: Annotated[Number, "Of the sensor above the plane of the map."] = 0.0
 
-    world: ClassVar[str] = "plane"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point", "point_height")
+    world = "plane"
+    sees_kinds = ("point", "point_height")
 
     @property
     def height(self) -> float:

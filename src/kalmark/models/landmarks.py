@@ -33,6 +33,8 @@ DepthSigma = Annotated[NotNegative, "Standard deviation of that."]
 class _Landmark:
     """Base of the landmarks: the compiled view `look`, of the form `seen.LOOK`, and the landmark of a view `of`."""
 
+    kind: ClassVar[str]
+    space: ClassVar[Space]
     look: ClassVar[Any]
     of: ClassVar[Any]
 
@@ -55,10 +57,10 @@ class Point2D(_Landmark):
     (array([4., 1.]), 'point')
     """
 
-    kind: ClassVar[str] = "point"
-    space: ClassVar[Space] = spaces.POINT2
-    look: ClassVar[Any] = staticmethod(landmarks2d.point_seen_from)
-    of: ClassVar[Any] = staticmethod(landmarks2d.point_from_view)
+    kind = "point"
+    space = spaces.POINT2
+    look = staticmethod(landmarks2d.point_seen_from)
+    of = staticmethod(landmarks2d.point_from_view)
 
     def place(self, l: Array) -> tuple[Array, Array]:
         """Return the positions (K, 2) and their Jacobian (K, 2, d)."""
@@ -78,8 +80,8 @@ class PointSignature2D(Point2D):
     ('point_signature', array([4. , 0. , 7.5]))
     """
 
-    kind: ClassVar[str] = "point_signature"
-    space: ClassVar[Space] = Space("point_signature", (spaces.VECTOR, spaces.SCALAR))
+    kind = "point_signature"
+    space = Space("point_signature", (spaces.VECTOR, spaces.SCALAR))
 
 
 @register("landmark", "point_height")
@@ -95,8 +97,8 @@ class PointHeight2D(Point2D):
     array([[5.]])
     """
 
-    kind: ClassVar[str] = "point_height"
-    space: ClassVar[Space] = Space("point_height", (spaces.VECTOR, spaces.SCALAR))
+    kind = "point_height"
+    space = Space("point_height", (spaces.VECTOR, spaces.SCALAR))
 
 
 @register("landmark", "polar")
@@ -112,10 +114,10 @@ class Polar2D(_Landmark):
     array([0. , 0. , 0.5, 4. ])
     """
 
-    kind: ClassVar[str] = "polar"
-    space: ClassVar[Space] = Space("polar", (spaces.VECTOR, spaces.HEADING, spaces.SCALAR))
-    look: ClassVar[Any] = staticmethod(landmarks2d.polar_seen_from)
-    of: ClassVar[Any] = staticmethod(landmarks2d.polar_from_view)
+    kind = "polar"
+    space = Space("polar", (spaces.VECTOR, spaces.HEADING, spaces.SCALAR))
+    look = staticmethod(landmarks2d.polar_seen_from)
+    of = staticmethod(landmarks2d.polar_from_view)
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the Euclidean points p (K, 2) and P_l (K, 2, 4)."""
@@ -145,11 +147,11 @@ class Wall2D(_Landmark):
     ] = 0.3
     extend: Annotated[bool, "The segment kept of the wall grows with what is seen of it."] = True
 
-    kind: ClassVar[str] = "wall"
-    space: ClassVar[Space] = Space("wall", (spaces.VECTOR, spaces.HEADING))
+    kind = "wall"
+    space = Space("wall", (spaces.VECTOR, spaces.HEADING))
     first_ends: ClassVar[tuple[float, float]] = (0.0, 0.0)
-    look: ClassVar[Any] = staticmethod(walls.wall_seen_from)
-    of: ClassVar[Any] = staticmethod(walls.wall_from_view)
+    look = staticmethod(walls.wall_seen_from)
+    of = staticmethod(walls.wall_from_view)
 
     def endpoints(self, l: Array, t: Array) -> tuple[Array, Array]:
         """Return the points (K, 2, 2) at abscissas t (K, 2), and P_l (K, 2, 2, 3)."""
@@ -174,10 +176,10 @@ class Point3D(_Landmark):
     (array([4. , 1. , 0.5]), 'point3')
     """
 
-    kind: ClassVar[str] = "point3"
-    space: ClassVar[Space] = spaces.POINT3
-    look: ClassVar[Any] = staticmethod(landmarks3d.point_seen_from)
-    of: ClassVar[Any] = staticmethod(landmarks3d.point_from_view)
+    kind = "point3"
+    space = spaces.POINT3
+    look = staticmethod(landmarks3d.point_seen_from)
+    of = staticmethod(landmarks3d.point_from_view)
 
     def complete(self, v: Array, V_y: Array, depth: bool) -> tuple[Array, Array, None]:
         """Return points (K, 3) for what a sensor found: points, or rays (K, 4) with their inverse distances."""
@@ -203,7 +205,6 @@ class _Depth(_Landmark):
     prior_rho_per_m: PriorDepth = 0.01
     sigma_rho_per_m: DepthSigma = 0.5
 
-    space: ClassVar[Space]
     point: ClassVar[Any]
     look_at_point: ClassVar[Any]  # what `look` is to a sensor that finds depth
 
@@ -264,13 +265,13 @@ class InverseDepth2D(_BecomesPoint):
     prior_rho_per_m: PriorDepth = 0.5
     sigma_rho_per_m: DepthSigma = 0.25
 
-    kind: ClassVar[str] = "inverse_depth_2d"
-    space: ClassVar[Space] = Space("inverse_depth_2d", (spaces.VECTOR, spaces.HEADING, spaces.RHO))
-    look: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_seen_from)
-    of: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_from_view)
-    point: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_to_point)
-    look_at_point: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_as_point)
-    index: ClassVar[Any] = staticmethod(landmarks2d.inverse_depth_linearity)
+    kind = "inverse_depth_2d"
+    space = Space("inverse_depth_2d", (spaces.VECTOR, spaces.HEADING, spaces.RHO))
+    look = staticmethod(landmarks2d.inverse_depth_seen_from)
+    of = staticmethod(landmarks2d.inverse_depth_from_view)
+    point = staticmethod(landmarks2d.inverse_depth_to_point)
+    look_at_point = staticmethod(landmarks2d.inverse_depth_as_point)
+    index = staticmethod(landmarks2d.inverse_depth_linearity)
 
 
 @register("landmark", "inverse_depth")
@@ -287,13 +288,13 @@ class InverseDepth3D(_BecomesPoint):
     ('inverse_depth', 6)
     """
 
-    kind: ClassVar[str] = "inverse_depth"
-    space: ClassVar[Space] = Space("inverse_depth", (spaces.ANCHOR, spaces.DIRECTION, spaces.RHO))
-    look: ClassVar[Any] = staticmethod(landmark_views.inverse_depth)
-    of: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_from_view)
-    point: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_to_point)
-    look_at_point: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_as_point)
-    index: ClassVar[Any] = staticmethod(landmarks3d.inverse_depth_linearity)
+    kind = "inverse_depth"
+    space = Space("inverse_depth", (spaces.ANCHOR, spaces.DIRECTION, spaces.RHO))
+    look = staticmethod(landmark_views.inverse_depth)
+    of = staticmethod(landmarks3d.inverse_depth_from_view)
+    point = staticmethod(landmarks3d.inverse_depth_to_point)
+    look_at_point = staticmethod(landmarks3d.inverse_depth_as_point)
+    index = staticmethod(landmarks3d.inverse_depth_linearity)
 
 
 @register("landmark", "anchored_homogeneous")
@@ -310,13 +311,13 @@ class AnchoredHomogeneous(_BecomesPoint):
     ('anchored_homogeneous', 7)
     """
 
-    kind: ClassVar[str] = "anchored_homogeneous"
-    space: ClassVar[Space] = Space("anchored_homogeneous", (spaces.ANCHOR, spaces.VECTOR3, spaces.RHO))
-    look: ClassVar[Any] = staticmethod(landmark_views.anchored)
-    of: ClassVar[Any] = staticmethod(landmarks3d.anchored_from_view)
-    point: ClassVar[Any] = staticmethod(landmarks3d.anchored_to_point)
-    look_at_point: ClassVar[Any] = staticmethod(landmarks3d.anchored_as_point)
-    index: ClassVar[Any] = staticmethod(landmarks3d.anchored_linearity)
+    kind = "anchored_homogeneous"
+    space = Space("anchored_homogeneous", (spaces.ANCHOR, spaces.VECTOR3, spaces.RHO))
+    look = staticmethod(landmark_views.anchored)
+    of = staticmethod(landmarks3d.anchored_from_view)
+    point = staticmethod(landmarks3d.anchored_to_point)
+    look_at_point = staticmethod(landmarks3d.anchored_as_point)
+    index = staticmethod(landmarks3d.anchored_linearity)
 
 
 @register("landmark", "homogeneous")
@@ -333,12 +334,12 @@ class Homogeneous(_Depth):
     ('homogeneous', 4)
     """
 
-    kind: ClassVar[str] = "homogeneous"
-    space: ClassVar[Space] = Space("homogeneous", (spaces.HOMOGENEOUS,))
-    look: ClassVar[Any] = staticmethod(landmark_views.homogeneous)
-    of: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_from_view)
-    point: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_to_point)
-    look_at_point: ClassVar[Any] = staticmethod(landmarks3d.homogeneous_as_point)
+    kind = "homogeneous"
+    space = Space("homogeneous", (spaces.HOMOGENEOUS,))
+    look = staticmethod(landmark_views.homogeneous)
+    of = staticmethod(landmarks3d.homogeneous_from_view)
+    point = staticmethod(landmarks3d.homogeneous_to_point)
+    look_at_point = staticmethod(landmarks3d.homogeneous_as_point)
 
 
 @dataclass(frozen=True)
@@ -395,10 +396,10 @@ class Tag(_Landmark):
     ('tag', 7)
     """
 
-    kind: ClassVar[str] = "tag"
-    space: ClassVar[Space] = SE3
-    look: ClassVar[Any] = staticmethod(tags.tag_seen_from)
-    of: ClassVar[Any] = staticmethod(tags.tag_from_view)
+    kind = "tag"
+    space = SE3
+    look = staticmethod(tags.tag_seen_from)
+    of = staticmethod(tags.tag_from_view)
 
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the centres (K, 3) and their Jacobian (K, 3, 6)."""
@@ -474,7 +475,7 @@ class _DirectionPrior(_Line):
     sigma_beta_1: Annotated[NotNegative, "Standard deviation of the first component."] = 0.25
     sigma_beta_2: Annotated[NotNegative, "Standard deviation of the second component."] = 1.0
 
-    first_ends: ClassVar[tuple[float, float]] = lines.PLUECKER_ABSCISSAS_M
+    first_ends = lines.PLUECKER_ABSCISSAS_M
     ends: ClassVar[Any]
 
     def _prior(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -492,7 +493,7 @@ class _DepthsPrior(_Line):
     prior_rho_per_m: Annotated[Number, "Inverse distance expected of both ends."] = 0.1
     sigma_rho_per_m: Annotated[NotNegative, "Standard deviation of each."] = 0.5
 
-    first_ends: ClassVar[tuple[float, float]] = lines.POINT_ABSCISSAS
+    first_ends = lines.POINT_ABSCISSAS
     end: ClassVar[type[_Depth]]
 
     def _prior(self) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -524,12 +525,12 @@ class PlueckerLine(_DirectionPrior):
     ('pluecker_line', 6)
     """
 
-    kind: ClassVar[str] = "pluecker_line"
-    space: ClassVar[Space] = Space("pluecker_line", (spaces.PLUECKER,))
-    look: ClassVar[Any] = staticmethod(lines.pluecker_seen_from)
-    of: ClassVar[Any] = staticmethod(lines.pluecker_from_view)
-    ends: ClassVar[Any] = staticmethod(lines.pluecker_endpoints)
-    anchored: ClassVar[bool] = False
+    kind = "pluecker_line"
+    space = Space("pluecker_line", (spaces.PLUECKER,))
+    look = staticmethod(lines.pluecker_seen_from)
+    of = staticmethod(lines.pluecker_from_view)
+    ends = staticmethod(lines.pluecker_endpoints)
+    anchored = False
 
 
 @register("landmark", "anchored_pluecker_line")
@@ -546,11 +547,11 @@ class AnchoredPlueckerLine(_DirectionPrior):
     ('anchored_pluecker_line', 9)
     """
 
-    kind: ClassVar[str] = "anchored_pluecker_line"
-    space: ClassVar[Space] = Space("anchored_pluecker_line", (spaces.VECTOR3, spaces.VECTOR3, spaces.VECTOR3))
-    look: ClassVar[Any] = staticmethod(lines.anchored_pluecker_seen_from)
-    of: ClassVar[Any] = staticmethod(lines.anchored_pluecker_from_view)
-    ends: ClassVar[Any] = staticmethod(lines.anchored_pluecker_endpoints)
+    kind = "anchored_pluecker_line"
+    space = Space("anchored_pluecker_line", (spaces.VECTOR3, spaces.VECTOR3, spaces.VECTOR3))
+    look = staticmethod(lines.anchored_pluecker_seen_from)
+    of = staticmethod(lines.anchored_pluecker_from_view)
+    ends = staticmethod(lines.anchored_pluecker_endpoints)
 
 
 @register("landmark", "inverse_depth_line")
@@ -567,10 +568,10 @@ class InverseDepthLine(_DepthsPrior):
     ('inverse_depth_line', 9)
     """
 
-    kind: ClassVar[str] = "inverse_depth_line"
-    space: ClassVar[Space] = Space("inverse_depth_line", (spaces.ANCHOR, *2 * (spaces.DIRECTION, spaces.RHO)))
-    look: ClassVar[Any] = staticmethod(lines.inverse_depth_line_seen_from)
-    end: ClassVar[type[_Depth]] = InverseDepth3D
+    kind = "inverse_depth_line"
+    space = Space("inverse_depth_line", (spaces.ANCHOR, *2 * (spaces.DIRECTION, spaces.RHO)))
+    look = staticmethod(lines.inverse_depth_line_seen_from)
+    end = InverseDepth3D
 
 
 @register("landmark", "anchored_homogeneous_line")
@@ -587,10 +588,10 @@ class AnchoredHomogeneousLine(_DepthsPrior):
     ('anchored_homogeneous_line', 11)
     """
 
-    kind: ClassVar[str] = "anchored_homogeneous_line"
-    space: ClassVar[Space] = Space("anchored_homogeneous_line", (spaces.ANCHOR, *2 * (spaces.VECTOR3, spaces.RHO)))
-    look: ClassVar[Any] = staticmethod(lines.anchored_homogeneous_line_seen_from)
-    end: ClassVar[type[_Depth]] = AnchoredHomogeneous
+    kind = "anchored_homogeneous_line"
+    space = Space("anchored_homogeneous_line", (spaces.ANCHOR, *2 * (spaces.VECTOR3, spaces.RHO)))
+    look = staticmethod(lines.anchored_homogeneous_line_seen_from)
+    end = AnchoredHomogeneous
 
 
 @register("landmark", "homogeneous_line")
@@ -607,11 +608,11 @@ class HomogeneousLine(_DepthsPrior):
     ('homogeneous_line', 8)
     """
 
-    kind: ClassVar[str] = "homogeneous_line"
-    space: ClassVar[Space] = Space("homogeneous_line", (spaces.HOMOGENEOUS, spaces.HOMOGENEOUS))
-    look: ClassVar[Any] = staticmethod(lines.homogeneous_line_seen_from)
-    end: ClassVar[type[_Depth]] = Homogeneous
-    anchored: ClassVar[bool] = False
+    kind = "homogeneous_line"
+    space = Space("homogeneous_line", (spaces.HOMOGENEOUS, spaces.HOMOGENEOUS))
+    look = staticmethod(lines.homogeneous_line_seen_from)
+    end = Homogeneous
+    anchored = False
 
 
 BUILT_IN = built_in("landmark")

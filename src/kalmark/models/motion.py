@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -161,7 +161,7 @@ class Unicycle(SpeedAndTurn):
     array([1.683, 0.919, 1.   ])
     """
 
-    moves: ClassVar[Any] = unicycle
+    moves = unicycle
 
 
 @register("motion", "odometry_2d")
@@ -183,11 +183,11 @@ class Odometry2D(PlanarMotion):
     sigma_turn_bias_radps: Annotated[Estimated, "Turn that all increments lack, in a second"] = 0.0
     sigma_turn_rad_per_m: TurnPerMetre = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
-    held: ClassVar[bool] = False
-    moves: ClassVar[Any] = increment_in_plane
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_theta_rad")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+    columns = ("dx_m", "dy_m", "dtheta_rad")
+    held = False
+    moves = increment_in_plane
+    sigmas = ("sigma_x_m", "sigma_y_m", "sigma_theta_rad")
+    calibrations = (
         ("scale", "sigma_scale"),
         ("turn_scale", "sigma_turn_scale"),
         ("turn_radps", "sigma_turn_bias_radps"),
@@ -219,7 +219,7 @@ class Ackermann(Steered):
     sigma_v_scale: Scale = 0.0
     sigma_steering_scale: SteeringScale = 0.0
 
-    moves: ClassVar[Any] = ackermann
+    moves = ackermann
 
     @cached_property
     def parameters(self) -> Array:
@@ -246,12 +246,12 @@ class Odometry3D(MotionModel):
     sigma_turn_scale: TurnScale = 0.0
     sigma_turn_bias_radps: Annotated[Estimated, "Turn about each axis that they lack, in a second"] = 0.0
 
-    space: ClassVar[Space] = SE3
-    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
-    held: ClassVar[bool] = False
-    moves: ClassVar[Any] = increment_in_space
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_z_m", *3 * ("sigma_rotation_rad",))
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+    space = SE3
+    columns = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    held = False
+    moves = increment_in_space
+    sigmas = ("sigma_x_m", "sigma_y_m", "sigma_z_m", *3 * ("sigma_rotation_rad",))
+    calibrations = (
         ("scale", "sigma_scale"),
         ("turn_scale", "sigma_turn_scale"),
         *((f"turn_{axis}_radps", "sigma_turn_bias_radps") for axis in "xyz"),
@@ -283,12 +283,12 @@ class Velocity3D(MotionModel):
     sigma_v_scale: Scale = 0.0
     sigma_w_scale: TurnScale = 0.0
 
-    space: ClassVar[Space] = SE3
-    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
-    held: ClassVar[bool] = True
-    moves: ClassVar[Any] = twist
-    sigmas: ClassVar[tuple[str, ...]] = tuple(f"sigma_{column}" for column in columns)
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+    space = SE3
+    columns = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    held = True
+    moves = twist
+    sigmas = tuple(f"sigma_{column}" for column in columns)
+    calibrations = (
         *((name, "sigma_v_bias_mps") for name in columns[:3]),
         *((name, "sigma_w_bias_radps") for name in columns[3:]),
         ("v_scale", "sigma_v_scale"),
@@ -320,14 +320,14 @@ class ConstantVelocity3D(MotionModel, CompiledVelocity):
     sigma_v_mps_per_sqrt_s: Annotated[NotNegative, "Random walk of the velocity, all the time."] = 0.0
     sigma_w_radps_per_sqrt_s: Annotated[NotNegative, "Random walk of the turn rate, all the time."] = 0.0
 
-    space: ClassVar[Space] = Space("SE3 with velocity", (VECTOR3, ROTATION, VECTOR3, SCALAR, SCALAR, SCALAR))
-    columns: ClassVar[tuple[str, ...]] = ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps")
-    held: ClassVar[bool] = False
-    moves: ClassVar[Any] = coast
-    velocity: ClassVar[Any] = velocity_of_coasting
-    coasts: ClassVar[bool] = True
-    state_columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
-    sigmas: ClassVar[tuple[str, ...]] = (*3 * ("sigma_v_mps",), *3 * ("sigma_w_radps",))
+    space = Space("SE3 with velocity", (VECTOR3, ROTATION, VECTOR3, SCALAR, SCALAR, SCALAR))
+    columns = ("dvx_mps", "dvy_mps", "dvz_mps", "dwx_radps", "dwy_radps", "dwz_radps")
+    held = False
+    moves = coast
+    velocity = velocity_of_coasting
+    coasts = True
+    state_columns = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    sigmas = (*3 * ("sigma_v_mps",), *3 * ("sigma_w_radps",))
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
         """Return the covariance (12, 12) of the walks of velocity and rate, and of the way and turn they make."""

@@ -24,6 +24,7 @@ from kalmark.declare import built_in
 from kalmark.geometry import frames3d
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
+from kalmark.geometry.spaces import Space
 from kalmark.models import landmark_views, landmarks, sensors
 from kalmark.models.landmark_views import EXPECT, LOOK, VARY, residual
 from kalmark.models.landmarks3d import multiply_many
@@ -362,6 +363,11 @@ class Compiled:
     """A motion whose step is compiled."""
 
     moves: ClassVar[Any]
+    space: ClassVar[Space]
+    columns: ClassVar[tuple[str, ...]]
+    held: ClassVar[bool]
+    coasts: ClassVar[bool]
+    state_columns: ClassVar[tuple[str, ...]]
 
     @property
     def parameters(self) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY, replace
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
@@ -94,8 +94,8 @@ class _Planar(Expecting):
     range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
     fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
 
-    world: ClassVar[str] = "plane"
-    expected: ClassVar[Any] = in_plane
+    world = "plane"
+    expected = in_plane
     code: ClassVar[int]
 
     def sees(self, v: Array) -> Flags:
@@ -126,7 +126,7 @@ class _Ranging(Expecting):
         if not (self.sigma_range_m or self.sigma_range_rel):
             raise refuse(self, "sigma_range_m", "a positive number")
 
-    varied: ClassVar[Any] = by_gain_and_offset
+    varied = by_gain_and_offset
     parameter_names: ClassVar[tuple[str, ...]] = ("gain", "offset")
 
     @property
@@ -210,9 +210,9 @@ class RangeBearing(_RangingBearing):
 
     sigma_bearing_rad: BearingNoise = 0.02
 
-    code: ClassVar[int] = RANGE_BEARING
-    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad")
+    code = RANGE_BEARING
+    columns = ("range_m", "bearing_rad")
+    sigmas = ("sigma_range_m", "sigma_bearing_rad")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return points v (K, 2) and V_y (K, 2, 2).  [S] (62)."""
@@ -232,11 +232,11 @@ class Bearing(_Planar):
 
     sigma_bearing_rad: BearingNoise = 0.02
 
-    code: ClassVar[int] = BEARING
-    columns: ClassVar[tuple[str, ...]] = ("bearing_rad",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_bearing_rad",)
-    finds_depth: ClassVar[bool] = False
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point", "inverse_depth_2d")
+    code = BEARING
+    columns = ("bearing_rad",)
+    sigmas = ("sigma_bearing_rad",)
+    finds_depth = False
+    sees_kinds = ("point", "inverse_depth_2d")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return rays v (K, 2) of length 1 and V_y (K, 2, 1)."""
@@ -254,9 +254,9 @@ class Bearing(_Planar):
 class _Range(_Ranging, Cone, Distancing):
     """A range alone, of either world."""
 
-    expected: ClassVar[Any] = distance
-    columns: ClassVar[tuple[str, ...]] = ("range_m",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m",)
+    expected = distance
+    columns = ("range_m",)
+    sigmas = ("sigma_range_m",)
 
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, 2 or 3) lie within the range limits and the cone of sight about x."""
@@ -292,8 +292,8 @@ class Range3D(_Range):
     array([[13.]])
     """
 
-    world: ClassVar[str] = "space"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+    world = "space"
+    sees_kinds = ("point3",)
 
 
 @register("sensor", "position")
@@ -312,9 +312,9 @@ class Position2D(_Planar):
     sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1
     sigma_y_m: Annotated[Positive, "Noise, to the left."] = 0.1
 
-    code: ClassVar[int] = POSITION
-    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m")
+    code = POSITION
+    columns = ("x_m", "y_m")
+    sigmas = ("sigma_x_m", "sigma_y_m")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the points (K, 2) and the identities (K, 2, 2)."""
@@ -337,9 +337,9 @@ class RangeBearingSignature(_RangingBearing):
     sigma_bearing_rad: BearingNoise = 0.02
     sigma_signature: Annotated[Positive, "Noise of the signature."] = 0.1
 
-    code: ClassVar[int] = RANGE_BEARING_SIGNATURE
-    columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "signature")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_bearing_rad", "sigma_signature")
+    code = RANGE_BEARING_SIGNATURE
+    columns = ("range_m", "bearing_rad", "signature")
+    sigmas = ("sigma_range_m", "sigma_bearing_rad", "sigma_signature")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return (x, y, signature) (K, 3) and V_y (K, 3, 3)."""

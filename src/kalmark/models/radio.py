@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 
@@ -90,10 +90,10 @@ class _SignalStrength(_Receiver):
     sigma_strength_db: Annotated[Estimated, "Standard deviation of the strength at 1 m"] = 0.0
     sigma_exponent: Annotated[Estimated, "Standard deviation of the exponent"] = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("rssi_dbm",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_db",)
-    expected: ClassVar[Any] = strength
-    varied: ClassVar[Any] = by_path_loss
+    columns = ("rssi_dbm",)
+    sigmas = ("sigma_db",)
+    expected = strength
+    varied = by_path_loss
     parameter_names: ClassVar[tuple[str, ...]] = ("strength_dbm", "exponent")
 
     @cached_property
@@ -145,8 +145,8 @@ class SignalStrength3D(_SignalStrength):
     array([[-60.]])
     """
 
-    world: ClassVar[str] = "space"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+    world = "space"
+    sees_kinds = ("point3",)
 
 
 @declared
@@ -155,9 +155,9 @@ class _RangeDifference(_Receiver):
     _: KW_ONLY
     baseline_m: Annotated[Positive, "From the right receiver to the left one, along the sensor's y axis."] = 0.5
 
-    columns: ClassVar[tuple[str, ...]] = ("difference_m",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",)
-    expected: ClassVar[Any] = range_difference
+    columns = ("difference_m",)
+    sigmas = ("sigma_m",)
+    expected = range_difference
 
     @cached_property
     def parameters(self) -> Array:
@@ -188,5 +188,5 @@ class RangeDifference3D(_RangeDifference):
     array([[0.29]])
     """
 
-    world: ClassVar[str] = "space"
-    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+    world = "space"
+    sees_kinds = ("point3",)

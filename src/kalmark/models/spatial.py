@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -41,12 +41,12 @@ class Wall(Spatial):
     fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
     min_length_m: Annotated[NotNegative, "Shortest segment that counts as seen."] = 0.5
 
-    world: ClassVar[str] = "plane"
-    expected: ClassVar[Any] = walls.wall
-    cov_size: ClassVar[int] = 2
-    columns: ClassVar[tuple[str, ...]] = ("distance_m", "normal_rad", "right_m", "left_m")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_distance_m", "sigma_normal_rad")
-    sees_kinds: ClassVar[tuple[str, ...]] = ("wall",)
+    world = "plane"
+    expected = walls.wall
+    cov_size = 2
+    columns = ("distance_m", "normal_rad", "right_m", "left_m")
+    sigmas = ("sigma_distance_m", "sigma_normal_rad")
+    sees_kinds = ("wall",)
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the segments themselves (K, 4), and V_y (K, 4, 2)."""
@@ -85,9 +85,9 @@ class RangeBearing3D(Cone, Spatial):
     sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
     sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
 
-    expected: ClassVar[Any] = landmark_views.range_bearing
-    columns: ClassVar[tuple[str, ...]] = ("range_m", "azimuth_rad", "elevation_rad")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad")
+    expected = landmark_views.range_bearing
+    columns = ("range_m", "azimuth_rad", "elevation_rad")
+    sigmas = ("sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return points v (K, 3) and V_y (K, 3, 3)."""
@@ -113,9 +113,9 @@ class Position3D(Cone, Spatial):
     sigma_y_m: Annotated[Positive, "Noise, along y."] = 0.1
     sigma_z_m: Annotated[Positive, "Noise, along z."] = 0.1
 
-    expected: ClassVar[Any] = landmark_views.position
-    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
+    expected = landmark_views.position
+    columns = ("x_m", "y_m", "z_m")
+    sigmas = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the points (K, 3) and the identities (K, 3, 3)."""
@@ -138,11 +138,11 @@ class TagPose(Spatial):
     sigma_position_m: Annotated[Positive, "Noise of each coordinate."] = 0.02
     sigma_rotation_rad: Annotated[Positive, "Noise of the rotation about each axis."] = 0.02
 
-    expected: ClassVar[Any] = landmark_views.tag_pose
-    cov_size: ClassVar[int] = 6
-    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-    sigmas: ClassVar[tuple[str, ...]] = (*3 * ("sigma_position_m",), *3 * ("sigma_rotation_rad",))
-    sees_kinds: ClassVar[tuple[str, ...]] = ("tag",)
+    expected = landmark_views.tag_pose
+    cov_size = 6
+    columns = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    sigmas = (*3 * ("sigma_position_m",), *3 * ("sigma_rotation_rad",))
+    sees_kinds = ("tag",)
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the poses themselves, their quaternions normalised, and the identity (K, 6, 6)."""

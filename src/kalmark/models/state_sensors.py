@@ -213,10 +213,9 @@ class StateSensor(Sensing):
 
     views: ClassVar[str]
     expected: ClassVar[Any]
-    varied: ClassVar[Any] = None
     constants: ClassVar[tuple[tuple[str, str, str], ...]] = ()
     code: ClassVar[int] = 0
-    sees_kinds: ClassVar[tuple[str, ...]] = ()
+    sees_kinds = ()
 
     def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
         """Return the expected readings (K, m) of views v (K, d), and E_v (K, p, errors of the view)."""
@@ -286,12 +285,12 @@ class Heading(StateSensor):
         NotNegative, "Standard deviation of the declination; above 0 it is in the map and is estimated."
     ] = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("heading_rad",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_heading_rad",)
-    views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = heading
-    varied: ClassVar[Any] = subtract_constant
-    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (("declination_rad", "sigma_declination_rad", ""),)
+    columns = ("heading_rad",)
+    sigmas = ("sigma_heading_rad",)
+    views = POSE
+    expected = heading
+    varied = subtract_constant
+    constants = (("declination_rad", "sigma_declination_rad", ""),)
 
 
 @declared
@@ -305,9 +304,9 @@ class _Gps(StateSensor):
         NotNegative, "Random walk of an error that lasts; above 0 it is in the map and is estimated."
     ] = 0.0
 
-    views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = antenna
-    varied: ClassVar[Any] = add_constants
+    views = POSE
+    expected = antenna
+    varied = add_constants
 
 
 @register("sensor", "gps")
@@ -325,12 +324,10 @@ class Gps2D(_Gps):
     bias_x_m: Bias = 0.0
     bias_y_m: Bias = 0.0
 
-    world: ClassVar[str] = "plane"
-    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m",) * 2
-    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
-        (f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xy"
-    )
+    world = "plane"
+    columns = ("x_m", "y_m")
+    sigmas = ("sigma_m",) * 2
+    constants = tuple((f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xy")
 
 
 @register("sensor", "gps")
@@ -350,12 +347,10 @@ class Gps3D(_Gps):
     bias_y_m: Bias = 0.0
     bias_z_m: Bias = 0.0
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m", "sigma_m", "sigma_z_m")
-    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
-        (f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xyz"
-    )
+    world = "space"
+    columns = ("x_m", "y_m", "z_m")
+    sigmas = ("sigma_m", "sigma_m", "sigma_z_m")
+    constants = tuple((f"bias_{axis}_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s") for axis in "xyz")
 
     @cached_property
     def _variances(self) -> tuple[float, ...]:
@@ -376,11 +371,11 @@ class AbsolutePose2D(StateSensor):
     sigma_m: Annotated[Positive, "Noise of each coordinate."] = 0.01
     sigma_theta_rad: Annotated[Positive, "Noise of the heading."] = 0.01
 
-    world: ClassVar[str] = "plane"
-    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "theta_rad")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m", "sigma_m", "sigma_theta_rad")
-    views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = pose_in_plane
+    world = "plane"
+    columns = ("x_m", "y_m", "theta_rad")
+    sigmas = ("sigma_m", "sigma_m", "sigma_theta_rad")
+    views = POSE
+    expected = pose_in_plane
 
 
 @register("sensor", "absolute_pose")
@@ -397,12 +392,12 @@ class AbsolutePose3D(StateSensor):
     sigma_m: Annotated[Positive, "Noise of each coordinate."] = 0.01
     sigma_rotation_rad: Annotated[Positive, "Noise of the rotation about each axis."] = 0.01
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-    sigmas: ClassVar[tuple[str, ...]] = (*("sigma_m",) * 3, *("sigma_rotation_rad",) * 3)
-    cov_size: ClassVar[int] = 6
-    views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = landmark_views.tag_pose
+    world = "space"
+    columns = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    sigmas = (*("sigma_m",) * 3, *("sigma_rotation_rad",) * 3)
+    cov_size = 6
+    views = POSE
+    expected = landmark_views.tag_pose
 
     def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
         """Return the poses v (K, 7) themselves, and how the innovations of y (K, 7) change with them (K, 6, 6)."""
@@ -430,13 +425,13 @@ class Height(StateSensor):
     sigma_bias_m: SigmaBias = 0.0
     sigma_bias_m_per_sqrt_s: Walk = 0.0
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("z_m",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_z_m",)
-    views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = height
-    varied: ClassVar[Any] = add_constants
-    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (("bias_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s"),)
+    world = "space"
+    columns = ("z_m",)
+    sigmas = ("sigma_z_m",)
+    views = POSE
+    expected = height
+    varied = add_constants
+    constants = (("bias_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s"),)
 
 
 @register("sensor", "inclination")
@@ -452,11 +447,11 @@ class Inclination(StateSensor):
 
     sigma_rad: Annotated[Positive, "Noise of each angle."] = 0.01
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("roll_rad", "pitch_rad")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_rad",) * 2
-    views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = inclination
+    world = "space"
+    columns = ("roll_rad", "pitch_rad")
+    sigmas = ("sigma_rad",) * 2
+    views = POSE
+    expected = inclination
 
 
 @register("sensor", "gravity")
@@ -478,13 +473,13 @@ class Gravity(StateSensor):
     bias_z_mps2: Bias = 0.0
     sigma_bias_mps2: SigmaBias = 0.0
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("ax_mps2", "ay_mps2", "az_mps2")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps2",) * 3
-    views: ClassVar[str] = POSE
-    expected: ClassVar[Any] = gravity
-    varied: ClassVar[Any] = plus_gravity
-    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (
+    world = "space"
+    columns = ("ax_mps2", "ay_mps2", "az_mps2")
+    sigmas = ("sigma_mps2",) * 3
+    views = POSE
+    expected = gravity
+    varied = plus_gravity
+    constants = (
         ("gravity_mps2", "", ""), *((f"bias_{axis}_mps2", "sigma_bias_mps2", "") for axis in "xyz"),
     )  # fmt: skip
 
@@ -500,10 +495,10 @@ class _Gyro(StateSensor):
     sigma_bias_radps: SigmaBias = 0.0
     sigma_bias_radps_per_sqrt_s: Walk = 0.0
 
-    views: ClassVar[str] = TWIST
+    views = TWIST
     sees_rates: ClassVar[bool] = True
-    expected: ClassVar[Any] = rates
-    varied: ClassVar[Any] = add_constants
+    expected = rates
+    varied = add_constants
 
     def __post_init__(self) -> None:
         if not (self.sigma_radps or self.sigma_rad_per_sqrt_s):
@@ -529,12 +524,10 @@ class Gyro2D(_Gyro):
     _: KW_ONLY
     bias_radps: Bias = 0.0
 
-    world: ClassVar[str] = "plane"
-    columns: ClassVar[tuple[str, ...]] = ("w_radps",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_radps",)
-    constants: ClassVar[tuple[tuple[str, str, str], ...]] = (
-        ("bias_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s"),
-    )
+    world = "plane"
+    columns = ("w_radps",)
+    sigmas = ("sigma_radps",)
+    constants = (("bias_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s"),)
 
 
 @register("sensor", "gyro")
@@ -553,12 +546,10 @@ class Gyro3D(_Gyro):
     bias_y_radps: Bias = 0.0
     bias_z_radps: Bias = 0.0
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("wx_radps", "wy_radps", "wz_radps")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_radps",) * 3
-    constants: ClassVar[tuple[tuple[str, str, str], ...]] = tuple(
-        (f"bias_{axis}_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s") for axis in "xyz"
-    )
+    world = "space"
+    columns = ("wx_radps", "wy_radps", "wz_radps")
+    sigmas = ("sigma_radps",) * 3
+    constants = tuple((f"bias_{axis}_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s") for axis in "xyz")
 
 
 @declared
@@ -569,7 +560,7 @@ class _Scaled(StateSensor):
     scale: Scale = 1.0
     sigma_scale: SigmaScale = 0.0
 
-    varied: ClassVar[Any] = by_gain
+    varied = by_gain
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -595,8 +586,8 @@ class _Scaled(StateSensor):
 class _Velocity(_Scaled):
     sigma_mps: Annotated[Positive, "Noise of each component."] = 0.05
 
-    views: ClassVar[str] = TWIST
-    expected: ClassVar[Any] = velocity
+    views = TWIST
+    expected = velocity
 
 
 @register("sensor", "body_velocity")
@@ -610,9 +601,9 @@ class BodyVelocity2D(_Velocity):
     array([0.5, 0.1])
     """
 
-    world: ClassVar[str] = "plane"
-    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",) * 2
+    world = "plane"
+    columns = ("vx_mps", "vy_mps")
+    sigmas = ("sigma_mps",) * 2
 
 
 @register("sensor", "body_velocity")
@@ -626,9 +617,9 @@ class BodyVelocity3D(_Velocity):
     array([0.5, 0.1, 0. ])
     """
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",) * 3
+    world = "space"
+    columns = ("vx_mps", "vy_mps", "vz_mps")
+    sigmas = ("sigma_mps",) * 3
 
 
 @register("sensor", "speed")
@@ -642,8 +633,8 @@ class Speed(_Velocity):
     array([0.5, 0. ])
     """
 
-    columns: ClassVar[tuple[str, ...]] = ("v_mps",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",)
+    columns = ("v_mps",)
+    sigmas = ("sigma_mps",)
 
 
 @register("sensor", "ground_speed")
@@ -661,10 +652,10 @@ class GroundSpeed(StateSensor):
 
     sigma_mps: Annotated[Positive, "Noise of the speed."] = 0.1
 
-    columns: ClassVar[tuple[str, ...]] = ("speed_mps",)
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps",)
-    views: ClassVar[str] = TWIST
-    expected: ClassVar[Any] = ground_speed
+    columns = ("speed_mps",)
+    sigmas = ("sigma_mps",)
+    views = TWIST
+    expected = ground_speed
 
 
 @declared
@@ -677,9 +668,9 @@ class _ZeroVelocity(StateSensor):
     sigma_mps: Annotated[Positive, "Velocity of a robot that stands, on each axis."] = 0.005
     sigma_radps: Annotated[Positive, "Turn rate of a robot that stands, about each axis."] = 0.005
 
-    views: ClassVar[str] = TWIST
+    views = TWIST
     sees_rates: ClassVar[bool] = True
-    expected: ClassVar[Any] = place
+    expected = place
 
 
 @register("sensor", "zero_velocity")
@@ -692,9 +683,9 @@ class ZeroVelocity2D(_ZeroVelocity):
     ('vx_mps', 'vy_mps', 'w_radps')
     """
 
-    world: ClassVar[str] = "plane"
-    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "w_radps")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_mps", "sigma_mps", "sigma_radps")
+    world = "plane"
+    columns = ("vx_mps", "vy_mps", "w_radps")
+    sigmas = ("sigma_mps", "sigma_mps", "sigma_radps")
 
 
 @register("sensor", "zero_velocity")
@@ -707,9 +698,9 @@ class ZeroVelocity3D(_ZeroVelocity):
     0.002
     """
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
-    sigmas: ClassVar[tuple[str, ...]] = (*("sigma_mps",) * 3, *("sigma_radps",) * 3)
+    world = "space"
+    columns = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+    sigmas = (*("sigma_mps",) * 3, *("sigma_radps",) * 3)
 
 
 # ------------------------------------------------------------------ of the way since the last reading
@@ -725,8 +716,8 @@ class _Odometer(_Scaled):
         "those that later readings count from.",
     ] = 1
 
-    views: ClassVar[str] = CHANGE
-    expected: ClassVar[Any] = increment
+    views = CHANGE
+    expected = increment
 
 
 @register("sensor", "odometer")
@@ -742,9 +733,9 @@ class Odometer2D(_Odometer):
     array([0.5 , 0.02, 0.1 ])
     """
 
-    world: ClassVar[str] = "plane"
-    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dtheta_rad")
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_m", "sigma_m", "sigma_rad")
+    world = "plane"
+    columns = ("dx_m", "dy_m", "dtheta_rad")
+    sigmas = ("sigma_m", "sigma_m", "sigma_rad")
 
 
 @register("sensor", "odometer")
@@ -759,6 +750,6 @@ class Odometer3D(_Odometer):
     array([0.5 , 0.02, 0.  ])
     """
 
-    world: ClassVar[str] = "space"
-    columns: ClassVar[tuple[str, ...]] = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
-    sigmas: ClassVar[tuple[str, ...]] = (*("sigma_m",) * 3, *("sigma_rad",) * 3)
+    world = "space"
+    columns = ("dx_m", "dy_m", "dz_m", "rx_rad", "ry_rad", "rz_rad")
+    sigmas = (*("sigma_m",) * 3, *("sigma_rad",) * 3)

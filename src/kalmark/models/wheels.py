@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 
@@ -132,11 +132,11 @@ class DifferentialDrive(PlanarMotion):
     ] = 0.0
     sigma_track_m: Annotated[Estimated, "How well the track is known"] = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("left_rad", "right_rad")
-    held: ClassVar[bool] = False
-    moves: ClassVar[Any] = wheel_increments
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_wheel_rad", "sigma_wheel_rad")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+    columns = ("left_rad", "right_rad")
+    held = False
+    moves = wheel_increments
+    sigmas = ("sigma_wheel_rad", "sigma_wheel_rad")
+    calibrations = (
         ("left_radius_m", "sigma_radius_m"),
         ("right_radius_m", "sigma_radius_m"),
         ("track_m", "sigma_track_m"),
@@ -205,7 +205,7 @@ class Tricycle(Steered):
     sigma_v_scale: Scale = 0.0
     sigma_steering_scale: SteeringScale = 0.0
 
-    moves: ClassVar[Any] = tricycle
+    moves = tricycle
 
     @cached_property
     def parameters(self) -> Array:
@@ -232,11 +232,11 @@ class Omnidirectional(PlanarMotion):
     sigma_w_scale: TurnScale = 0.0
     sigma_turn_rad_per_m: TurnPerMetre = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = ("vx_mps", "vy_mps", "w_radps")
-    held: ClassVar[bool] = True
-    moves: ClassVar[Any] = sideways
-    sigmas: ClassVar[tuple[str, ...]] = ("sigma_vx_mps", "sigma_vy_mps", "sigma_w_radps")
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (
+    columns = ("vx_mps", "vy_mps", "w_radps")
+    held = True
+    moves = sideways
+    sigmas = ("sigma_vx_mps", "sigma_vy_mps", "sigma_w_radps")
+    calibrations = (
         ("vx_mps", "sigma_v_bias_mps"),
         ("vy_mps", "sigma_v_bias_mps"),
         ("w_radps", "sigma_w_bias_radps"),
@@ -271,13 +271,13 @@ class Mecanum(PlanarMotion):
     sigma_v_scale: Scale = 0.0
     sigma_w_scale: TurnScale = 0.0
 
-    columns: ClassVar[tuple[str, ...]] = (
+    columns = (
         "front_left_radps", "front_right_radps", "rear_left_radps", "rear_right_radps",
     )  # fmt: skip
-    held: ClassVar[bool] = True
-    moves: ClassVar[Any] = mecanum
-    sigmas: ClassVar[tuple[str, ...]] = 4 * ("sigma_wheel_radps",)
-    calibrations: ClassVar[tuple[tuple[str, str], ...]] = (("v_scale", "sigma_v_scale"), ("w_scale", "sigma_w_scale"))
+    held = True
+    moves = mecanum
+    sigmas = 4 * ("sigma_wheel_radps",)
+    calibrations = (("v_scale", "sigma_v_scale"), ("w_scale", "sigma_w_scale"))
 
     @cached_property
     def wheels(self) -> Array:
@@ -314,9 +314,9 @@ class SlippingUnicycle(SpeedAndTurn):
 
     sigma_slip_per_sqrt_s: Annotated[NotNegative, "Random walk of the slip, while it moves."] = 0.02
 
-    space: ClassVar[Space] = Space("SE2 with slip", (VECTOR, HEADING, SCALAR))
-    moves: ClassVar[Any] = move_with_slip
-    state_columns: ClassVar[tuple[str, ...]] = ("slip",)
+    space = Space("SE2 with slip", (VECTOR, HEADING, SCALAR))
+    moves = move_with_slip
+    state_columns = ("slip",)
 
     def diffusion(self, u: Array, dt_s: float) -> Array | None:
         """Return the covariance (4, 4) of the walks of pose and slip in `dt_s`, in the frame where the robot ends."""
