@@ -17,15 +17,17 @@ from kalmark.association.global_start import (
     distinct,
     hypotheses,
     locate_points,
+    locate_rays,
     locate_tags,
     points_at_poses,
     refine_pose,
     search,
 )
-from kalmark.association.relocalization import align_points, is_same_pose
+from kalmark.association.relocalization import align_points, is_same_pose, resect
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import to_frame
 from kalmark.geometry.pose_frames import FRAMES
+from kalmark.geometry.spaces import SE2, SE3
 from kalmark.tracks.known_landmarks import Known
 
 PLACES = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0], [9.0, 1.0], [5.0, 8.0], [-6.0, 3.0]])
@@ -157,3 +159,25 @@ def test_the_tag_with_which_most_agree_determines_a_pose() -> None:
     assert found.gain == 21.0
     np.testing.assert_allclose(found.T, pose, atol=1e-9)
     assert isinstance(locate_tags(of, [9], np.array(seen[:1]), cov[:1]), str)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_directions_determine_a_pose_by_those_that_agree(d: int) -> None:
+    rng = np.random.default_rng(d + 5)
+    l, frames = rng.uniform(-9, 9, (14, d)), FRAMES[3 if d == 2 else 7]
+    pose = T if d == 2 else np.array([1.0, -2.0, 0.5, 0.1, 0.5, -0.5, 0.7])
+    pose[3:] /= np.linalg.norm(pose[3:]) if d == 3 else 1.0
+    of = Known(km.landmarks.Point2D() if d == 2 else km.landmarks.Point3D())
+    for i, place in enumerate(l):
+        of.add(i, place + (4.0 if i == 0 else 0.0))
+    v = frames.to_frame(pose, l)[0]
+    v = v / np.linalg.norm(v, axis=1, keepdims=True) + rng.normal(0.0, 0.002, v.shape)
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    exact = frames.to_frame(pose, l)[0]
+    np.testing.assert_allclose(resect(exact / np.linalg.norm(exact, axis=1, keepdims=True), l), pose, atol=1e-9)
+    found = locate_rays(of, [*range(14)], v, np.full(14, 0.002))
+    assert isinstance(found, Proposal)
+    assert found.matched.tolist() == [-1, *range(1, 14)]
+    off = SE2.minus(found.T, pose) if d == 2 else SE3.minus(found.T, pose)
+    assert off @ np.linalg.solve(found.cov, off) < 12.0
+    assert isinstance(locate_rays(of, [0, 1], v[:2], np.full(2, 0.002)), str)

@@ -65,6 +65,15 @@ def test_what_is_held_back_does_not_pull_the_pose() -> None:
     np.testing.assert_array_equal(slam.covariance("cart"), before[1])
 
 
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
+def test_a_robot_that_has_lost_its_way_is_found_before_it_maps_a_garden_twice(estimator: object) -> None:
+    slam, reports = carried_off(slam_of(estimator), sigma=3.0, off=2.5)
+    assert [gap.kind for r in reports for gap in r.gaps] == ["elsewhere"]
+    assert len(slam.landmarks()) == len(GARDEN)
+    assert np.linalg.norm(slam.mean("cart")) < 0.2
+
+
+@pytest.mark.usefixtures("never_found")
 @pytest.mark.parametrize("map_", ["dense", "postponed"])
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
 def test_a_garden_mapped_twice_becomes_one(estimator: object, map_: str) -> None:
@@ -91,6 +100,7 @@ def test_landmarks_that_were_seen_in_one_scan_are_never_merged() -> None:
     assert len(slam.landmarks()) == 2
 
 
+@pytest.mark.usefixtures("never_found")
 def test_a_merge_resumes_bit_for_bit(tmp_path: Path) -> None:
     slam = slam_of(confirm=2)
     for t in range(6):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -76,12 +75,6 @@ def test_places_of_which_one_has_landmarks_that_the_other_has_not_are_two() -> N
     assert found(slam) == []
 
 
-@pytest.fixture
-def never_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no robot be found by its landmarks after a gap."""
-    monkeypatch.setattr("kalmark.slam.elsewhere.ODDS", math.inf)
-
-
 @pytest.mark.usefixtures("never_found")
 def test_a_hall_mapped_twice_is_reported_with_its_time_and_drawn(tmp_path: Path) -> None:
     run = mapped(hall(1, gap_s=4.0), gaps="ignore")
@@ -101,6 +94,7 @@ def test_a_hall_mapped_once_has_no_repeats() -> None:
     assert mapped(hall(2)).evaluate()["repeats"] == []
 
 
+@pytest.mark.usefixtures("never_found")
 def test_a_hall_mapped_twice_becomes_one_where_repeats_are_merged() -> None:
     log = hall(5, gap_s=4.0)
     run = mapped(log, gaps="ignore", repeats="merge")

@@ -17,15 +17,18 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.association.relocalization import align_points, is_same_pose
+from kalmark.association.relocalization import align_points, is_same_pose, resect
 from kalmark.events import Id
 from kalmark.geometry import frames3d
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.pose_frames import FRAMES
+from kalmark.geometry.spaces import SE2, SE3
 from kalmark.tracks.known_landmarks import Known
 
 FEWEST = 3  # pairs without ids
 FEWEST_NAMED = {2: 2, 3: 3}  # with ids, by the dimensions of the world
+FEWEST_RAYS = {2: 3, 3: 6}  # directions with ids
+STEPS = 5  # of least squares
 LOTS = 32  # of so few pairs that are drawn
 LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
 SURE = 7.0  # the most that one landmark counts: log odds
@@ -64,27 +67,82 @@ class Proposal(NamedTuple):
 
 def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:
     """Return the pose that points v (K, d) with these ids and sigmas (K,) determine, or why they do not."""
-    rows = rows_of(of, ids)
-    if (rows >= 0).sum() >= FEWEST_NAMED[v.shape[1]]:
-        pose = _most_agreeing(of, v, sigma, rows)
-        gain = 0.0 if isinstance(pose, str) else SURE * (pose.pairs - FEWEST_NAMED[v.shape[1]])
-    elif v.shape[1] == 3:
-        return f"its scan has {(rows >= 0).sum()} landmarks with ids, a pose in space needs {FEWEST_NAMED[3]}"
-    else:
-        unnamed = np.array([k for k, i in enumerate(ids) if i is None], dtype=np.int64)
-        found = search(of, v[unnamed], sigma[unnamed])
-        pose, gain = found, 0.0
-        if not isinstance(found, str):
-            pose = GlobalPose(found.T, np.full(len(v), -1))
-            pose.matched[unnamed] = found.matched
-            chance = by_chance(of, v[unnamed], sigma[unnamed], found.pairs, len(of.names) ** 2)
-            gain = -math.log(max(chance, math.exp(-2.0 * SURE)))
-    if isinstance(pose, str):
-        return pose
-    some = pose.matched >= 0
-    J = FRAMES[len(pose.T)].from_frame(pose.T, v[some])[1]
-    W = (LOOSE * sigma[some]) ** -2.0
-    return Proposal(pose.T, np.linalg.inv(np.einsum("kai,k,kaj->ij", J, W, J)), pose.matched, gain)
+    rows, d = rows_of(of, ids), v.shape[1]
+    if d == 3 or (rows >= 0).sum() >= FEWEST_NAMED[d]:
+        return _most_agreeing(of, rows, FEWEST_NAMED[d], _Points(v, sigma))
+    unnamed = np.array([k for k, i in enumerate(ids) if i is None], dtype=np.int64)
+    found = search(of, v[unnamed], sigma[unnamed])
+    if isinstance(found, str):
+        return found
+    matched = np.full(len(v), -1)
+    matched[unnamed] = found.matched
+    chance = by_chance(of, v[unnamed], sigma[unnamed], found.pairs, len(of.names) ** 2)
+    some = np.flatnonzero(matched >= 0)
+    cov = _Points(v, sigma).covariance(found.T, of.places()[matched], some)
+    return Proposal(found.T, cov, matched, -math.log(max(chance, math.exp(-2.0 * SURE))))
+
+
+def locate_rays(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:
+    """Return the pose that unit vectors v (K, d) with these ids and sigmas (K,), rad, determine, or why they do not."""
+    return _most_agreeing(of, rows_of(of, ids), FEWEST_RAYS[v.shape[1]], _Rays(v, sigma))
+
+
+class _Points(NamedTuple):
+    """Points v (K, d) in the frame of a sensor, with their sigmas (K,)."""
+
+    v: Array
+    sigma: Array
+
+    def solve(self, l: Array, some: Index) -> Array:
+        """Return the pose by some of the landmarks l (K, d)."""
+        return align_points(self.v[some], l[some], self.sigma[some] ** -2)
+
+    def misfits(self, T: Array, l: Array, some: Index) -> Array:
+        """Return the squared distances, in sigmas, over their gate."""
+        off = (FRAMES[len(T)].from_frame(T, self.v[some])[0] - l[some]) / (LOOSE * self.sigma[some, None])
+        return np.sum(off**2, axis=1) / chi2_gate(REACH, off.shape[1])
+
+    def covariance(self, T: Array, l: Array, some: Index) -> Array:
+        """Return the covariance of the pose."""
+        J = FRAMES[len(T)].from_frame(T, self.v[some])[1]
+        return np.linalg.inv(np.einsum("kai,k,kaj->ij", J, (LOOSE * self.sigma[some]) ** -2, J))
+
+
+class _Rays(NamedTuple):
+    """Directions v (K, d) in the frame of a sensor, unit vectors, with their sigmas (K,), rad."""
+
+    v: Array
+    sigma: Array
+
+    def solve(self, l: Array, some: Index) -> Array:
+        """Return the pose by some of the landmarks l (K, d): the linear solution, then least squares of the angles."""
+        T = resect(self.v[some], l[some])
+        space = SE2 if len(T) == 3 else SE3
+        for _ in range(STEPS):
+            off, J, _ = self._angles(T, l, some)
+            weights = 1.0 / self.sigma[some, None]
+            step = np.linalg.lstsq((J * weights[..., None]).reshape(-1, space.dof), -(off * weights).ravel())[0]
+            T = space.plus(T, np.asarray(step, dtype=np.float64))
+        return T
+
+    def _angles(self, T: Array, l: Array, some: Index) -> tuple[Array, Array, Flags]:
+        """Return how far landmarks are beside their rays (K, d - 1), rad, its Jacobian, and which are ahead (K,)."""
+        p, J = FRAMES[len(T)].to_frame(T, l[some])[:2]
+        across = np.linalg.svd(self.v[some, None, :])[2][:, 1:]
+        r = np.linalg.norm(p, axis=1) + 1e-300
+        off = np.einsum("kad,kd->ka", across, p) / r[:, None]
+        return off, across @ J / r[:, None, None], np.sum(p * self.v[some], axis=1) > 0.0
+
+    def misfits(self, T: Array, l: Array, some: Index) -> Array:
+        """Return the squared angles, in sigmas, over their gate; infinite of what is behind."""
+        off, _, ahead = self._angles(T, l, some)
+        off = off / (LOOSE * self.sigma[some, None])
+        return np.where(ahead, np.sum(off**2, axis=1) / chi2_gate(REACH, off.shape[1]), np.inf)
+
+    def covariance(self, T: Array, l: Array, some: Index) -> Array:
+        """Return the covariance of the pose."""
+        J = self._angles(T, l, some)[1]
+        return np.linalg.inv(np.einsum("kai,k,kaj->ij", J, (LOOSE * self.sigma[some]) ** -2, J))
 
 
 def rows_of(of: Known, ids: Sequence[Id | None]) -> Index:
@@ -93,26 +151,27 @@ def rows_of(of: Known, ids: Sequence[Id | None]) -> Index:
     return np.array([-1 if name is None else at.get(name, -1) for name in ids], dtype=np.int64)
 
 
-def _most_agreeing(of: Known, v: Array, sigma: Array, rows: Index) -> GlobalPose | str:
-    """Return the pose with which most points v (K, d) of landmarks `rows` (K,) agree, and the landmarks of these."""
-    some, d, rng = np.flatnonzero(rows >= 0), v.shape[1], np.random.default_rng(0)
-    l, fewest, best, pose = of.places()[rows], FEWEST_NAMED[d], np.zeros(0, dtype=np.int64), np.zeros(3)
+def _most_agreeing(of: Known, rows: Index, fewest: int, seen: _Points | _Rays) -> Proposal | str:
+    """Return the pose with which most observations of landmarks `rows` (K,) agree; so few of them determine one."""
+    some, l, rng = np.flatnonzero(rows >= 0), of.places()[rows], np.random.default_rng(0)
+    if len(some) < fewest:
+        return f"its scan has {len(some)} landmarks with ids, a pose by these needs {fewest}"
+    pose, best = np.zeros(0), some[:0]
     for lot in range(LOTS):
         chosen = some if lot == 0 else rng.choice(some, fewest, replace=False)
         for _ in range(2):  # the second time by all that agree
-            T = align_points(v[chosen], l[chosen], sigma[chosen] ** -2)
-            off = FRAMES[len(T)].from_frame(T, v[some])[0] - l[some]
-            near = np.sum(off**2, axis=1) <= chi2_gate(REACH, d) * (LOOSE * sigma[some]) ** 2
-            chosen = some[near] if near.sum() >= fewest else chosen
-        if len(best) < near.sum():
-            best, pose = some[near], T
+            T = seen.solve(l, chosen)
+            near = some[seen.misfits(T, l, some) <= 1.0]
+            chosen = near if len(near) >= fewest else chosen
+        if len(best) < len(near):
+            pose, best = T, near
         if len(best) == len(some):
             break
     if len(best) < fewest:
         return f"its {len(some)} landmarks with ids do not agree on a pose"
     matched = np.full(len(rows), -1)
     matched[best] = rows[best]
-    return GlobalPose(pose, matched)
+    return Proposal(pose, seen.covariance(pose, l, best), matched, SURE * (len(best) - fewest))
 
 
 def locate_tags(of: Known, ids: Sequence[Id | None], v: Array, cov: Array) -> Proposal | str:

@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.association.global_start import LOOSE, SURE, Proposal, locate_points, locate_tags
+from kalmark.association.global_start import LOOSE, SURE, Proposal, locate_points, locate_rays, locate_tags, rows_of
 from kalmark.association.relocalization import is_same_pose
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
@@ -31,13 +31,13 @@ from kalmark.report import ELSEWHERE, Gap
 from kalmark.slam.alternative import Alternative, write_robot
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.state import State
+from kalmark.tracks.channel import EUCLIDEAN
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.surveys import SURVEYED
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
 WIDER = 3.0  # times its sigmas by which a filter that is too sure may be off
-KINDS = "point", "point3", "tag"
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
 HELD = 2  # scans of several landmarks that are held back without an alternative
 MOST = 48  # landmarks of a constellation
@@ -45,10 +45,12 @@ MEANWHILE = "mapped while its robot was elsewhere"
 
 
 def concerns(scan: ScanContext) -> bool:
-    """Return whether a scan determines where its robot is: it finds places of points, in space by ids, or tags."""
-    channel = scan.channel
-    is_known = scan.dimensions == 2 or (scan.event.ids is not None and None not in scan.event.ids)
-    return channel.gives_places and not channel.joins and channel.landmark.kind in KINDS and is_known
+    """Return whether a scan determines where its robot is: by points of the plane; by points, tags or rays with ids."""
+    channel, ids = scan.channel, scan.event.ids
+    if channel.gives_places and scan.dimensions == 2:
+        return not channel.joins and channel.landmark.kind == "point"
+    is_known = ids is not None and None not in ids
+    return is_known and (channel.gives_rays or (channel.gives_places and channel.landmark.kind in ("point3", "tag")))
 
 
 def correct(
@@ -88,8 +90,11 @@ def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> l
     if not far:
         return []
     y = np.ascontiguousarray(update.y[far, : scan.y.shape[1]])
-    places = cast("Array", scan.channel.places(scan.map, scan.robot, y))
-    return [k for k, p in zip(far, places, strict=True) if done.d2[k] > limit or np.isfinite(p).all()]
+    places = scan.channel.places(scan.map, scan.robot, y)
+    is_seen = done.d2[far] > limit
+    if places is not None:
+        is_seen |= np.isfinite(places).all(axis=1)
+    return [k for k, is_one in zip(far, is_seen.tolist(), strict=True) if is_one]
 
 
 def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
@@ -102,7 +107,7 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
         return
     _note(scan, of, look)
     if scan.adrift:
-        of.ratio, of.since_ns = -math.inf, state.moving[robot].held.adrift_since_ns
+        of.ratio, of.since_ns = -SURE, state.moving[robot].held.adrift_since_ns
     if of.ratio >= 0.0 and all_named:
         del state.evidence[robot]
     if of.ratio <= -SURE:
@@ -144,8 +149,9 @@ def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | N
 
 def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
     """Return the landmarks that were in the map before, as they are now."""
-    tracks, kind, young = state.tracks, scan.channel.landmark.kind, of.young
-    known, old = tracks.known.of_kind.get(kind), Known(scan.channel.landmark)
+    tracks, young, channel = state.tracks, of.young, scan.channel
+    kind = channel.landmark.kind if channel.gives_places else EUCLIDEAN[scan.dimensions - 2]
+    known, old = tracks.known.of_kind.get(kind), Known(channel.models[kind].landmark)
     for name in known.names if known is not None else ():
         old.add(name, _block(state, name)[1])
     for name, track in tracks.confirmed.items():
@@ -185,6 +191,9 @@ def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Propos
     if scan.channel.landmark.kind == "tag":
         v, V = scan.channel.calibrated(scan.map).invert(scan.y)
         found = locate_tags(old, scan.ids, v, V @ scan.R @ V.swapaxes(1, 2))
+    elif scan.channel.gives_rays:
+        v, sigma = scan.places()
+        found = locate_rays(old, scan.ids, v, sigma * math.sqrt(scan.dimensions / (scan.dimensions - 1)))
     else:
         found = locate_points(old, *_constellation(state, scan, of))
     return None if isinstance(found, str) else found
@@ -202,15 +211,16 @@ def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     of.gain, of.fitted = found.gain, {old.names[row] for row in found.matched if row >= 0}
 
 
-def _pair(scan: ScanContext, places: Array, old: Known) -> dict[int, int]:
-    """Return by the rows of old landmarks the observations at `places` (K, 2) that may be of them, the nearest of each.
+def _pair(scan: ScanContext, places: Array | None, old: Known) -> dict[int, int]:
+    """Return by the rows of old landmarks the observations at `places` (K, d) that may be of them, the nearest of each.
 
     With an id it is the landmark of that name, without one the nearest.
     """
-    gaps, nearest = old.tree().query(np.nan_to_num(places))
-    at = {name: row for row, name in enumerate(old.names)}
-    pairs = [(at.get(name) if name is not None else int(nearest[k]), k) for k, name in enumerate(scan.ids)]
-    return {row: k for row, k in sorted(pairs, key=lambda pair: -gaps[pair[1]]) if row is not None}
+    rows, gaps = rows_of(old, scan.ids), np.zeros(len(scan.ids))
+    if places is not None and None in scan.ids:
+        gaps, nearest = old.tree().query(places)
+        rows = np.where([name is None for name in scan.ids], nearest, rows)
+    return {int(rows[k]): int(k) for k in np.argsort(-gaps, kind="stable") if rows[k] >= 0}
 
 
 def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
@@ -219,9 +229,9 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     The constellation has to be one of old landmarks there, and nowhere else, still.
     """
     robot, channel = scan.event.robot, scan.channel
-    other, model = state.alternatives[robot], channel.models[channel.landmark.kind]
+    other, model = state.alternatives[robot], channel.models[old.model.kind]
     view, places = replace(scan, map=other.map), channel.places(other.map, scan.robot, scan.y)
-    pairs = {} if places is None or not len(old.names) else _pair(scan, places, old)
+    pairs = _pair(scan, places, old) if len(old.names) else {}
     logs, fits = dict[Id, float](), dict[Id, int]()
     if pairs:
         names, rows = [old.names[row] for row in pairs], [*pairs.values()]

@@ -153,6 +153,8 @@ class Channel:
         self.starts_landmarks = full and any_depth
         placed = all(has_place(model.landmark.space) for model in self.models.values())
         self.gives_places = full and self.finds_depth and placed
+        points = any(kind in EUCLIDEAN for kind in self.kinds) and not protocols.distances_alone(sensor)
+        self.gives_rays = full and points and not (self.finds_depth or self.sees_velocity)
         self.has_limits, self.fov_rad = isinstance(sensor, protocols.Visible), protocols.field_of_view(sensor)
         segmented = (kind for kind, model in self.models.items() if isinstance(model.landmark, protocols.Segmented))
         self.points = self.kinds - {*segmented}  # kinds of landmarks that are no lines
