@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -35,3 +36,9 @@ def data() -> Callable[[str], Path]:
 def oracle() -> Callable[[str], Path]:
     """Return the path of a recording made with another program."""
     return _finder("KALMARK_ORACLE")
+
+
+@pytest.fixture
+def never_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no robot be found by its landmarks."""
+    monkeypatch.setattr("kalmark.slam.elsewhere.ODDS", math.inf)

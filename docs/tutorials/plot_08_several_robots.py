@@ -47,6 +47,7 @@ scan("alpha", [0.0, 0.0, 0.0], [[3.0, 1.0]], ["post"])
 scan("beta", [6.0, 0.0, np.pi], [[3.0, 1.0]], ["post"])
 print("by the post:     ", sigmas("beta"))
 ax.plot(*ellipse("beta"), "C3", label="beta by the post")
+# sphinx_gallery_defer_figures
 
 # %%
 # Robots that see each other

@@ -59,7 +59,7 @@ def _place(labels: list[_Label], renderer: Any) -> None:
     pixels = renderer.points_to_pixels(1.0)
     for each in labels:
         each.set_position((0, 0))
-        if len(each.point) == 3:
+        if axes.name == "3d":
             x, y, _, w = axes.get_proj() @ [*each.point, 1.0]
             each.xy = float(x / w), float(y / w)
     at = axes.transData.transform([each.xy for each in labels])
