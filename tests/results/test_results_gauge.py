@@ -174,6 +174,6 @@ def test_pictures_page_and_verdict_say_whether_accuracy_is_of_the_shape_or_in_th
 def test_the_truth_of_a_picture_ends_where_its_path_does() -> None:
     run = mapped(2)
     scene, whole = Scene.of(run, 20), Scene.of(run)
-    assert len(scene.truth["rover"]) == len(scene.paths["rover"]) == 21
-    assert len(whole.truth["rover"]) == len(run.history.t_ns)
+    assert len(scene.ways["rover"].truth) == len(scene.ways["rover"].path) == 21
+    assert len(whole.ways["rover"].truth) == len(run.history.t_ns)
     assert scene.low.tolist() == whole.low.tolist()

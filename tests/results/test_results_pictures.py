@@ -19,6 +19,7 @@ from kalmark.association import ByIdentity
 from kalmark.cli.shared import print_summary
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry import ellipse
+from kalmark.geometry.gaussian import contours
 from kalmark.logs.log import Log, PositionTrack
 from kalmark.results.evaluate import headline
 from kalmark.results.figure_texts import BATCH, ROBOT, TOTALS, column_header, count, figure
@@ -26,7 +27,7 @@ from kalmark.results.plot import LANDMARK_COLOUR, draw_map, save_map
 from kalmark.results.record import record
 from kalmark.results.report import POINTS, common_reasons, figure_text, report_html, series
 from kalmark.results.run import Run
-from kalmark.results.scene import Scene, contours, group_steps, stretches_of
+from kalmark.results.scene import Scene, group_steps, stretches_of
 from results_world import circle, slam_for
 
 
@@ -102,7 +103,7 @@ def test_truth_is_shown_in_the_frame_of_the_map() -> None:
     log = circle(steps=60)
     elsewhere = recorded(log, start=(7.0, -3.0, 1.2))
     scene = Scene.of(elsewhere)
-    gap = (scene.truth["rover"] - scene.paths["rover"])[:, :2]
+    gap = (scene.ways["rover"].truth - scene.ways["rover"].path)[:, :2]
     assert np.linalg.norm(gap, axis=1).max() < 0.2
     means, _ = elsewhere.landmarks.positions()
     true = np.array([scene.true_landmarks[i] for i in elsewhere.landmarks.ids])
@@ -116,7 +117,7 @@ def test_position_fixes_are_shown_where_the_robot_was_and_not_its_antenna() -> N
     track = log.gps["rover"]
     log.gps["rover"] = PositionTrack(track.t_ns, track.xy + lever, np.array([2.0, 0.0]))
     run = recorded(log)
-    fixes = Scene.of(run).fixes["rover"]
+    fixes = Scene.of(run).ways["rover"].fixes
     assert np.abs(np.linalg.norm(fixes - [0.0, 5.0], axis=1) - 5.0).max() < 0.5
     assert run.evaluate()["fix_median_m"] < 0.2
 
@@ -279,7 +280,7 @@ def test_fixes_that_the_filter_used_are_drawn_where_they_were_measured() -> None
     log = circle(steps=10)
     fix = Fix(t_ns=log.events[-1].t_ns, robot="rover", y=(1.0, 0.1), cov=np.eye(2))
     run = record(slam_for(log), [*log.events, fix], progress=False)
-    assert Scene.of(run).used["rover"].tolist() == [[1.0, 0.1]]
+    assert Scene.of(run).ways["rover"].used.tolist() == [[1.0, 0.1]]
     assert page_data(report_html(run))["usedFixes"] == {"rover": {"x": [1.0], "y": [0.1]}}
     assert "fixes used" in [text.get_text() for text in draw_map(run).legends[0].get_texts()]
 

@@ -14,6 +14,7 @@ import pytest
 import kalmark as km
 from browser import said_by_page
 from kalmark.errors import RunError
+from kalmark.geometry.gaussian import contours
 from kalmark.results.history import Camera
 from kalmark.results.landmark_table import EUCLIDEANS, LINES, OTHERS, shapes
 from kalmark.results.plot import Projection, box_corners, draw_map, grid_spacing, save_map
@@ -21,7 +22,7 @@ from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
 from kalmark.results.report import report_html
 from kalmark.results.run import Run
-from kalmark.results.scene import Scene, clip_line, contours, images
+from kalmark.results.scene import Scene, clip_line, images
 from results_space import FORWARD, SIGMA, START, slam_for, spiral, with_camera
 
 WRONG = 13

@@ -20,6 +20,7 @@ from kalmark.campaign.scoring import NEES, Scores
 from kalmark.files import replace_folder, write
 from kalmark.geometry.gaussian import quantile
 from kalmark.results.evaluate import none_for_nan
+from kalmark.results.figure_texts import Figures
 from kalmark.results.scene import COLOURS, group_steps
 
 POINTS = 400  # of a curve, at most
@@ -93,7 +94,7 @@ def rms(values: Any) -> float:
     return mean(np.asarray(values) ** 2) ** 0.5
 
 
-def figures(scores: Sequence[Scores], skip: int = 0) -> dict[str, Any]:
+def figures(scores: Sequence[Scores], skip: int = 0) -> Figures:
     """Return the figures of one estimator over all runs, diverged ones included.
 
     `..._anees` is the average over steps, `..._inside` the share of steps inside the 95 % band, both after the first
@@ -101,7 +102,7 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> dict[str, Any]:
     the runs scatter: the steps of one are correlated.  `..._median` of pose NEES over all runs and steps is not moved
     by a run that diverges.  What the runs do not have (velocities, uncertain mounts) is left out.
     """
-    result: dict[str, Any] = {"runs": len(scores), "diverged": sum(s.diverged for s in scores)}
+    result: Figures = {"runs": len(scores), "diverged": sum(s.diverged for s in scores)}
     stopped = sorted({s.stopped for s in scores if s.stopped})
     if stopped:
         result["stopped"] = stopped
@@ -247,7 +248,7 @@ class Campaign:
         low, high = (a[:, self.skip :][np.isfinite(a[:, self.skip :])] for a in (anees.low, anees.high))
         return [float(np.median(low)), float(np.median(high))] if len(low) else None
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Figures:
         """Return the figures of ``summary.json``: a section for each estimator."""
         head = {self.kind: self.world, "seed": self.seed, "runs": self.runs, "steps": len(self.t_s)}
         head |= {"map_every": self.map_every, "skip": self.skip, "path": self.path}

@@ -64,11 +64,6 @@ InSight = tuple[Index, Index, Array, Array]  # as `visible_points` returns
 Sightings = tuple[Index, Index, Index, Array, Array]  # as `by_landmark` returns
 
 
-def sensor_noise(sensor: RangeBearing) -> Noise:
-    """Return the noise of a sensor as compiled code takes it."""
-    return sensor.sigma_range_m, sensor.sigma_range_rel, sensor.sigma_bearing_rad, sensor.scale, sensor.bias_m
-
-
 # ---------------------------------------------------------------------- what the engine runs
 def refusal(world: Any, configs: Mapping[str, Config]) -> str:
     """Return the reasons why the engine does not run a scene with these filters; empty if it does."""
@@ -446,7 +441,8 @@ class _Filter:
         cov = np.zeros((3, 3)) if robot.cov is None else np.asarray(robot.cov)
         self.start = np.array(robot.start), np.array(cov)
         self.control = motion.control_noise(NO_CONTROL), density_of(motion), motion.held
-        self.sensed = np.array(mount.at), sensor_noise(mount.sensor)
+        s = mount.sensor
+        self.sensed = np.array(mount.at), (s.sigma_range_m, s.sigma_range_rel, s.sigma_bearing_rad, s.scale, s.bias_m)
         limits = (estimator.iterations, float(estimator.tolerance)) if isinstance(estimator, Invariant) else (1, 0.0)
         self.rules = (float(channel.gate), *limits)
         self.coordinates = estimator.coordinates

@@ -21,6 +21,7 @@ from kalmark.campaign.scoring import Scores
 from kalmark.campaign.sweep_cells import Cell, value_as_yaml
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
+from kalmark.results.figure_texts import Figures
 from kalmark.results.report import figure_text
 from kalmark.results.scene import COLOURS
 
@@ -32,10 +33,10 @@ _PANELS = (
 )
 
 
-def run_figures(score: Scores, names: list[str], skip: int) -> dict[str, Any]:
+def run_figures(score: Scores, names: list[str], skip: int) -> Figures:
     """Return the figures of one run; `..._nees` are averages over robots and steps after the first `skip`."""
     series = score.series
-    row: dict[str, Any] = {"diverged": score.diverged, "stopped": score.stopped}
+    row: Figures = {"diverged": score.diverged, "stopped": score.stopped}
     for name in names:
         over = series["joint_dof"] if name == "joint" else 1.0
         row[f"{name}_nees"] = mean((series[name] / over)[:, skip:])
@@ -80,7 +81,7 @@ class Sweep:
         """The keys that were swept."""
         return tuple(self.cells[0].settings)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> Figures:
         """Return the figures of ``summary.json``: without a sweep those of the campaign, else a section a cell."""
         summaries = [campaign.summary() for campaign in self.campaigns]
         if not self.keys:
@@ -95,7 +96,7 @@ class Sweep:
         cells = [{"settings": cell.settings, **{key: summary[key] for key in own}} for cell, summary in pairs]
         return {**head, "sweep": grid, "cells": cells}
 
-    def runs(self) -> list[dict[str, Any]]:
+    def runs(self) -> list[Figures]:
         """Return one row a cell, estimator and run: settings, figures; run i has the same number in all cells."""
         return [
             {**cell.settings, "estimator": name, "run": number, **run_figures(score, kinds(scores), campaign.skip)}
@@ -109,7 +110,7 @@ class Sweep:
 
         By default all figures.
         """
-        rows: list[tuple[list[Any], dict[str, Any]]] = []
+        rows: list[tuple[list[Any], Figures]] = []
         for cell, campaign in zip(self.cells, self.campaigns, strict=True):
             for name, figures in campaign.summary()["estimators"].items():
                 rows.append(([*map(value_as_yaml, cell.settings.values()), name], figures))
@@ -166,7 +167,7 @@ class Sweep:
         along = (numeric or self.keys)[-1]
         values = [*dict.fromkeys(value_as_yaml(cell.settings[along]) for cell in self.cells)]
         at = {text: float(text) if numeric else float(i) for i, text in enumerate(values)}
-        curves: dict[str, list[dict[str, Any]]] = {}
+        curves: dict[str, list[Figures]] = {}
         for row in rows:
             others = [_setting(key, row[key]) for key in self.keys if key != along]
             same = any(key.endswith("estimator.type") for key in self.keys)

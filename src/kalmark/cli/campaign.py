@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,6 +17,7 @@ from kalmark.cli.shared import (
     say,
     writable,
 )
+from kalmark.results.figure_texts import Figures
 
 if TYPE_CHECKING:
     from kalmark.campaign import Campaign, Sweep
@@ -98,7 +99,7 @@ def print_campaign(campaign: Campaign) -> None:
     """Print one row a figure, one column an estimator."""
     from kalmark.campaign.campaign import FIGURES
 
-    estimators: dict[str, dict[str, Any]] = campaign.summary()["estimators"]
+    estimators: dict[str, Figures] = campaign.summary()["estimators"]
     rows = []
     for key, label in FIGURES:
         if any(figures.get(key) is not None for figures in estimators.values()):

@@ -16,6 +16,7 @@ from kalmark.results.figure_texts import (
     DIFFERENCE_TITLE,
     ROBOT,
     TOTALS,
+    Summary,
     column_header,
     difference_rows,
     figure,
@@ -82,7 +83,7 @@ def say(text: str, err: bool = False) -> None:
     typer.echo("\n".join(map(printable, text.split("\n"))), err=err)
 
 
-def print_summary(title: str, summary: Mapping[str, Any]) -> None:
+def print_summary(title: str, summary: Summary) -> None:
     """Print the key figures of a run's summary, its warnings and advice; other programs on the same log in brackets."""
     from kalmark.results.self_calibration import ESTIMATE_COLUMNS, MOUNT_COLUMNS, estimate_rows, mount_rows
     from kalmark.results.verdict_text import verdict_lines
@@ -93,7 +94,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
         if summary.get(key) is not None and (summary[key] or key not in _SHOWN_IF_ANY)
     ]
     print_table(title, ("", "", ""), rows, align="<><")
-    robots: Mapping[str, Any] = summary.get("robots", {})
+    robots: Summary = summary.get("robots", {})
     shown = [(key, column_header(label, unit), unit) for key, label, unit in ROBOT]
     shown = [row for row in shown if any(figures.get(row[0]) is not None for figures in robots.values())]
     if shown:
@@ -112,7 +113,7 @@ def print_summary(title: str, summary: Mapping[str, Any]) -> None:
     estimates = estimate_rows(summary)
     if estimates:
         print_table("calibrations, estimated", ESTIMATE_COLUMNS, estimates, align="<<>>")
-    batch: Mapping[str, Any] = summary.get("batch", {})
+    batch: Summary = summary.get("batch", {})
     if batch:
         figures = {key: value for key, value in batch.items() if key != "pose_differences"}
         compared = [(label, cell_text(v), unit) for _, label, v, unit in rows_with_labels(figures, BATCH)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -88,12 +89,29 @@ def ellipse(mean: Any, cov: Any, sigmas: float = 1.0, points: int = 16) -> Array
 
 def ellipses(means: Array, covs: Array, sigmas: float = 1.0, points: int = 16) -> Array:
     """Return the n-sigma contours (K, points + 1, 2) of 2-D Gaussians, closed; NaN of what is not finite."""
-    known: Flags = np.logical_and(np.isfinite(covs).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
+    return contours(means, covs, sigmas, points)[:, 0]
+
+
+def contours(means: Array, covs: Array, sigmas: float = 3.0, points: int | None = None) -> Array:
+    """Return the contours (K, C, points + 1, d) of Gaussians, closed: ellipses, in space three great circles each.
+
+    [S] (85)-(87).  NaN where a Gaussian is not finite.  By default 40 points, in space 24.
+    """
+    d = means.shape[1]
+    alpha = np.linspace(0.0, 2.0 * np.pi, 1 + (points or (40 if d == 2 else 24)))
+    circles = np.zeros((d * (d - 1) // 2, d, len(alpha)))
+    for circle, (i, j) in zip(circles, combinations(range(d), 2), strict=True):
+        circle[i], circle[j] = np.cos(alpha), np.sin(alpha)
+    known = is_finite(means, covs)
     values, axes = np.linalg.eigh(np.where(known[:, None, None], covs, 0.0))
-    alpha = 2 * np.pi / points * np.arange(points + 1)
-    half = axes * (sigmas * np.sqrt(np.maximum(values, 0.0)))[:, None, :]
-    out = means[:, None] + np.stack([np.cos(alpha), np.sin(alpha)], axis=1) @ half.swapaxes(1, 2)
-    return np.where(known[:, None, None], out, np.nan)
+    half = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    out = means[:, None, None, :] + sigmas * np.einsum("kij,cjp->kcpi", half, circles)
+    return np.where(known[:, None, None, None], out, np.nan)
+
+
+def is_finite(means: Array, covs: Array) -> Flags:
+    """Return which Gaussians (K,) are finite."""
+    return np.logical_and(np.isfinite(covs).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
 
 
 def mahalanobis(x: Any, mean: Any, cov: Any) -> float:

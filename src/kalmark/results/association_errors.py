@@ -9,6 +9,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.events import Id
+from kalmark.results.figure_texts import Figures
 from kalmark.results.history import History, as_id
 from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks
 from kalmark.results.recording import Recording
@@ -36,7 +37,7 @@ def best_known(history: History, ids: list[Id], observations: list[int]) -> dict
     return {i: as_id(name) for name, (_, i) in taken.items()}
 
 
-def association_figures(history: History, landmarks: list[Id]) -> dict[str, Any]:
+def association_figures(history: History, landmarks: list[Id]) -> Figures:
     """Return the figures of an association without ids, {} if the filter got all ids of the log.
 
     `wrong` counts the fused observations whose id is not that of most of their landmark, of `judged`; `duplicates` are

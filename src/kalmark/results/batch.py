@@ -7,7 +7,6 @@ to a fraction of its sigma, and with the same sigma; one that is not claims a sm
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +27,8 @@ from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
 from kalmark.models.protocols import Landmark, OfState, SeesVelocity
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
+from kalmark.results.figure_texts import Figures
+from kalmark.results.filter_description import mounts_of
 from kalmark.results.history import History, RobotStart, as_id
 from kalmark.results.landmark_table import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 
-def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dict[str, Any]:
+def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> Figures:
     """Return the entry `batch` of a run's summary: `compare_with_filter`, or of a run that saw tags `compare_tags`.
 
     The association of observations without ids in the log is decided again (`second_opinion`).  The log
@@ -56,8 +57,8 @@ def batch_entry(run: Recording, log: Log | Iterable[Event] | None = None) -> dic
     walls = any(isinstance(track.model, Wall2D) for track in run.final_slam().tracks.confirmed.values())
     if walls or not unknown(run).any():
         return compare_with_filter(run, solve_batch(run, log))
-    opinion = second_opinion(run, log)
-    return compare_with_filter(run, opinion.found.batch, opinion.found.merged) | opinion.as_dict()
+    found, differences = second_opinion(run, log)
+    return compare_with_filter(run, found.batch, found.merged) | differences
 
 
 def unknown(run: Recording) -> Flags:
@@ -65,45 +66,18 @@ def unknown(run: Recording) -> Flags:
     return (run.history.id == "") & (run.history.outcome != "ignored")
 
 
-@dataclass(frozen=True)
-class Opinion:
-    """A batch solution with associations of its own, and in how many observations they differ from the filter's.
-
-    `changed` are of another landmark, `added` are of one where the filter had none, `left_out` the reverse; a landmark
-    that was `merged` with another counts as that.  `split`: landmarks made of observations that the filter gave to
-    others; `found`: of those that it gave to none.
-    """
-
-    found: Reassociated
-    observations: int
-    changed: int
-    added: int
-    left_out: int
-    split: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures as they are in ``summary.json``."""
-        return {
-            "observations": self.observations,
-            "observations_changed": self.changed,
-            "observations_added": self.added,
-            "observations_left_out": self.left_out,
-            "landmarks_merged": len(self.found.merged),
-            "landmarks_split": self.split,
-            "landmarks_found": len(self.found.new) - self.split,
-            "association_rounds": self.found.rounds,
-            "association_settled": self.found.settled,
-        }
-
-
-def second_opinion(run: Recording, log: Log | Iterable[Event], *, known: Known | None = None) -> Opinion:
+def second_opinion(run: Recording, log: Log | Iterable[Event]) -> tuple[Reassociated, Figures]:
     """Find the batch solution of a run whose log does not give all associations, which are decided again at it.
 
-    Begins at the associations of the filter; see `kalmark.batch.reassociation`.  Raises KalmarkError as `solve_batch`.
+    Begins at the associations of the filter; see `kalmark.batch.reassociation`.  Second are the figures of how these
+    differ from the filter's: observations `changed` are of another landmark, those `added` of one where the filter had
+    none, those `left_out` the reverse; a landmark that was merged with another counts as that.  Landmarks `split` are
+    made of observations that the filter gave to others, those `found` of those that it gave to none.  Raises
+    KalmarkError as `solve_batch`.
     """
     open_ = unknown(run)
     rows = np.flatnonzero(run.history.fused | open_)
-    given = batch_input(run, known, rows)
+    given = batch_input(run, rows=rows)
     numbers = track(range(1, ROUNDS + 1), "second opinion: round of association")
     found = reassociate(BatchReplay.of(given, log), open_[rows], numbers)
     changed = added = left_out = 0
@@ -116,7 +90,17 @@ def second_opinion(run: Recording, log: Log | Iterable[Event], *, known: Known |
         if after in made_of:
             made_of[after].append(old is not None)
     split = sum(2 * sum(had) > len(had) for had in made_of.values())
-    return Opinion(found, len(rows), changed, added, left_out, split)
+    return found, {
+        "observations": len(rows),
+        "observations_changed": changed,
+        "observations_added": added,
+        "observations_left_out": left_out,
+        "landmarks_merged": len(found.merged),
+        "landmarks_split": split,
+        "landmarks_found": len(found.new) - split,
+        "association_rounds": found.rounds,
+        "association_settled": found.settled,
+    }
 
 
 def solve_batch(
@@ -156,7 +140,10 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
     robots = slam.robots
     landmarks = filtered_map(run)
     ids = {str(id_): id_ for id_ in landmarks} | {name: name for name in robots}
-    fused = np.flatnonzero(history.fused & ~_misplaced(history))
+    placed = history.fused
+    for gap in history.carried():  # by a robot that was elsewhere than the filter had it
+        placed &= ~history.while_carried(gap)[history.step]
+    fused = np.flatnonzero(placed)
     rows = _of_places(history, slam, fused if rows is None else rows)
     fused = _of_places(history, slam, fused)
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
@@ -191,12 +178,6 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
         left_out=rejected,
         carried={name: tuple(gap.start_ns for gap in history.carried(name)) for name in robots},
     )
-
-
-def _misplaced(history: History) -> Flags:
-    """Return which observations (O,) were made while their robot was elsewhere than the filter had it."""
-    lost = [history.while_carried(gap)[history.step] for gap in history.carried()]
-    return np.any([np.zeros(len(history.step), dtype=np.bool_), *lost], axis=0)
 
 
 def _moved(history: History, again: Mapping[str, Restart]) -> Array:
@@ -249,8 +230,7 @@ def _surveyed(history: History) -> Known:
 
 def filter_only_sensors(slam: Slam) -> set[tuple[str, str]]:
     """Return the sensors (robot, name) whose readings no batch solution has: of the state, and of range rates."""
-    mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
-    return {key for key, mount in mounted.items() if isinstance(mount.sensor, SeesVelocity | OfState)}
+    return {key for key, mount in mounts_of(slam.robots).items() if isinstance(mount.sensor, SeesVelocity | OfState)}
 
 
 def _of_places(history: History, slam: Slam, rows: Index) -> Index:
@@ -305,8 +285,7 @@ def tag_problem(run: Recording) -> Problem:
     Mounts that the filter calibrates may move.  Raises KalmarkError if no corners of a tag in the map were seen.
     """
     history, slam = run.history, run.final_slam()
-    mounted = {(robot.name, n): m for robot in slam.robots.values() for n, m in robot.sensors.items()}
-    cameras = [key for key, mount in mounted.items() if isinstance(mount.sensor, TagCorners)]
+    cameras = {key: mount for key, mount in mounts_of(slam.robots).items() if isinstance(mount.sensor, TagCorners)}
     ids = {str(id_): id_ for id_ in slam.landmarks().ids}
     rows = np.flatnonzero(history.fused & np.isin(history.landmark, list(ids)))
     rows = rows[[(history.robot[history.step[row]], history.sensor[row]) in cameras for row in rows]]
@@ -324,14 +303,14 @@ def tag_problem(run: Recording) -> Problem:
         associations=Associations(scan, sensor, index, names, history.e[rows]),
         landmarks={id_: (slam.mean(id_), slam.covariance(id_)) for id_ in dict.fromkeys(names)},
         motion=False,
-        mounts={key: slam.mean(".".join(key)) for key in cameras if mounted[key].cov is not None},
+        mounts={key: slam.mean(".".join(key)) for key, mount in cameras.items() if mount.cov is not None},
     )
     y = np.split(history.y[rows, :9], first[1:])
     scans = zip(t_ns.tolist(), robot.tolist(), sensor[first].tolist(), y, strict=True)
     return replay_events(given, (Scan(t_ns=t, robot=name, sensor=camera, y=seen) for t, name, camera, seen in scans))
 
 
-def compare_with_filter(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None) -> dict[str, Any]:
+def compare_with_filter(run: Recording, batch: Batch, merged: Mapping[Id, Id] | None = None) -> Figures:
     """Return the distances of the filter's map and path from the optimum of the same data.
 
     `merged` maps landmarks of the filter to those of the batch solution that they were merged into.
@@ -367,7 +346,7 @@ def compare_with_filter(run: Recording, batch: Batch, merged: Mapping[Id, Id] | 
     }
 
 
-def _over_time(run: Recording, batch: Batch) -> dict[str, Any]:
+def _over_time(run: Recording, batch: Batch) -> Figures:
     """Return the differences of the poses in sigmas of the filter: of all, and of each robot over time."""
     history = run.history
     e = pose_error(history.poses, batch.poses, run.coordinates)
@@ -386,7 +365,7 @@ def _over_time(run: Recording, batch: Batch) -> dict[str, Any]:
     }
 
 
-def compare_tags(run: Recording, problem: Problem, batch: Batch) -> dict[str, Any]:
+def compare_tags(run: Recording, problem: Problem, batch: Batch) -> Figures:
     """Return the RMS of the corners, and how far apart path and map are when the tags' corners are aligned rigidly.
 
     The filter's path is as it was then, with the map and the mounts that the run ended with.  `median_px`: of the

@@ -15,7 +15,7 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import short_text
 from kalmark.results.evaluate import summary_of
-from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, column_header, figure
+from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, Figures, column_header, figure
 from kalmark.results.history import Ints
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.plot import draw_plan, legend
@@ -32,7 +32,7 @@ class Comparison:
     """Runs by their names; `figures` of each, and the keys in which their configurations differ."""
 
     runs: Mapping[str, Recording]
-    figures: dict[str, dict[str, Any]]
+    figures: dict[str, Figures]
     differing: dict[str, list[str]]
 
     @property
@@ -70,7 +70,7 @@ def compare(runs: Mapping[str, Recording]) -> Comparison:
     return Comparison(runs, {name: _figures(run, first) for name, run in runs.items()}, _differing(runs))
 
 
-def _figures(run: Recording, first: Recording) -> dict[str, dict[str, Any]]:
+def _figures(run: Recording, first: Recording) -> dict[str, Figures]:
     """Return the figures of a run, by the part that they are of: the log, then each robot."""
     summary = summary_of(run)
     keys = ("events", *(key for key, _, _ in TOTALS))

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 
 from kalmark.arrays import Flags
 from kalmark.report import ELSEWHERE, Gap
-from kalmark.results.figure_texts import count, figure
+from kalmark.results.figure_texts import Figures, Summary, count, figure
 from kalmark.results.history import History
+from kalmark.results.measures import place_sigma
 from kalmark.results.recording import Recording
 
 KNOWN = 0.5  # of the sigma that a gap gave it, below which the position is known again
@@ -30,7 +30,7 @@ def merge_gaps(found: list[Gap]) -> tuple[Gap, ...]:
     return tuple(whole.values())
 
 
-def gap_figures(run: Recording) -> list[dict[str, Any]]:
+def gap_figures(run: Recording) -> list[Figures]:
     """Return the gaps as they are in ``summary.json``: times in seconds of the log, sigmas that the pose was given.
 
     `known_s` is when the position was known again to half of that, None if it never was.
@@ -63,37 +63,30 @@ def while_lost(history: History) -> Flags:
 
 def _known_s(history: History, gap: Gap) -> float | None:
     later = np.flatnonzero((history.robot == gap.robot) & (history.t_ns >= gap.end_ns))
-    sigma = np.sqrt(np.trace(history.covariance[later, : history.d, : history.d], axis1=1, axis2=2) / history.d)
-    again = later[sigma <= max(KNOWN * gap.sigma_m, _before(history, gap))]
+    earlier = np.flatnonzero((history.robot == gap.robot) & (history.t_ns <= gap.start_ns))
+    sigma, before = (place_sigma(history.covariance[rows], history.d) for rows in (later, earlier[-1:]))
+    again = later[sigma <= max(KNOWN * gap.sigma_m, before.sum())]
     return float(history.t_ns[again[0]]) * 1e-9 if len(again) else None
 
 
-def _before(history: History, gap: Gap) -> float:
-    """Return the sigma of a coordinate before a gap."""
-    earlier = np.flatnonzero((history.robot == gap.robot) & (history.t_ns <= gap.start_ns))
-    if not len(earlier):
-        return 0.0
-    return float(np.sqrt(np.trace(history.covariance[earlier[-1], : history.d, : history.d]) / history.d))
-
-
-def is_reported(gap: dict[str, Any]) -> bool:
+def is_reported(gap: Figures) -> bool:
     """Return whether a gap left the pose so uncertain that it is worth a line."""
     return max(gap["sigma_m"], gap["sigma_rad"]) > NOTED and gap["end_s"] - gap["start_s"] > NOTED_S
 
 
-def stayed_lost(gap: dict[str, Any]) -> bool:
+def stayed_lost(gap: Figures) -> bool:
     """Return whether a robot was not localized again after a gap that was bridged."""
     return gap["action"] == "widen" and gap["known_s"] is None and is_reported(gap)
 
 
-def carried_line(gap: Mapping[str, Any]) -> str:
+def carried_line(gap: Summary) -> str:
     """Return that a robot came elsewhere in an unknown way, and where and when it was found."""
     moved = f"{figure(gap['sigma_m'])} m and {figure(float(np.degrees(gap['sigma_rad'])), 2)} deg"
     since = f"{gap['robot']} was elsewhere from t={gap['start_s']:.1f} s on"
     return f"{since}: its landmarks placed it {moved} away at t={gap['end_s']:.1f} s"
 
 
-def controls_left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]:
+def controls_left_out(summary: Summary) -> Iterator[tuple[float, str]]:
     """Yield of each robot the time, s of the log, and a line of the controls that were beyond its limits."""
     odd = [gap for gap in summary.get("gaps", ()) if gap["kind"] == RULED_OUT]
     for robot in dict.fromkeys(gap["robot"] for gap in odd):
@@ -105,7 +98,7 @@ def controls_left_out(summary: Mapping[str, Any]) -> Iterator[tuple[float, str]]
         )
 
 
-def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
+def gap_notes(gaps: list[Figures]) -> Iterator[str]:
     """Yield a line a robot of the gaps that were bridged, and of controls that were left out."""
     yield from (line for _, line in controls_left_out({"gaps": gaps}))
     yield from (carried_line(gap) for gap in gaps if gap["kind"] == ELSEWHERE)
@@ -122,7 +115,7 @@ def gap_notes(gaps: list[dict[str, Any]]) -> Iterator[str]:
         )
 
 
-def gap_warnings(gaps: list[dict[str, Any]]) -> Iterator[str]:
+def gap_warnings(gaps: list[Figures]) -> Iterator[str]:
     """Warn of gaps after which the map may be wrong: ignored ones, and those after which the robot stayed lost."""
     for gap in gaps:
         lasts = f"no controls of {gap['robot']} for {figure(gap['end_s'] - gap['start_s'])} s"

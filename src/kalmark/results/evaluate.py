@@ -15,17 +15,17 @@ from kalmark.logs.source import records_of
 from kalmark.report import OUTCOMES
 from kalmark.results.association_errors import association_figures, best_known, by_position, no_ids
 from kalmark.results.control_gaps import gap_figures, gap_notes
-from kalmark.results.figure_texts import count, figure
+from kalmark.results.figure_texts import Figures, count, figure
 from kalmark.results.history import History, Ints
 from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks
 from kalmark.results.measures import (
     Rigid,
     aligned_rmse,
+    associated_nis,
     has_diverged,
     identity_alignment,
     nees,
     nees_limit,
-    nis,
     path_m,
     pose_error,
     rigid_robust,
@@ -45,13 +45,13 @@ PIXEL = 2  # numbers that a camera without depth measures of a point
 SETTLED = 0.01  # of the map's extent: the sigma below which a point that is not Euclidean yet is compared
 
 
-def evaluate(run: Recording) -> dict[str, Any]:
+def evaluate(run: Recording) -> Figures:
     """Return the figures of ``summary.json``; a figure that needs what is not there is absent or None."""
     history = run.history
     robots = {name: robot_figures(run, name) for name in history.robots}
     step_us = history.step_us[1:][np.isfinite(history.step_us[1:])]
     controls, fixes = sum(c.number for c in history.controls.values()), history.fixes
-    summary: dict[str, Any] = {
+    summary: Figures = {
         "log": run.log.as_dict(),
         "estimator": run.estimator,
         "coordinates": run.coordinates,
@@ -101,7 +101,7 @@ def evaluate(run: Recording) -> dict[str, Any]:
     return summary
 
 
-def scale_notes(run: Recording, robots: dict[str, Any]) -> Iterator[str]:
+def scale_notes(run: Recording, robots: Figures) -> Iterator[str]:
     """Yield a line for each robot whose scale is not observable, or not by a sensor."""
     for name, figures in robots.items():
         if figures.get("scale") is not None and scale_is_free(run, name):
@@ -112,7 +112,7 @@ def scale_notes(run: Recording, robots: dict[str, Any]) -> Iterator[str]:
             yield f"{name} sees no scale, and its velocity drifts: sigmas of places may be several times too small"
 
 
-def summary_of(run: Recording) -> dict[str, Any]:
+def summary_of(run: Recording) -> Figures:
     """Return the figures of a run as evaluated last, or now if they never were."""
     return run.summary or evaluate(run)
 
@@ -154,12 +154,12 @@ def headline(run: Recording) -> tuple[str, list[str]]:
     return title, parts
 
 
-def robot_figures(run: Recording, name: str) -> dict[str, Any]:
+def robot_figures(run: Recording, name: str) -> Figures:
     """Return the figures of one robot: against its truth if there is one, else against position fixes."""
     mine = run.history.robot == name
     mean, P = run.history.poses[mine], run.history.pose_covariances[mine]
     truth = run.truth.poses_in_map()[mine]
-    figures: dict[str, Any] = {"scans": int(mine.sum()) if run.history.scans else 0}
+    figures: Figures = {"scans": int(mine.sum()) if run.history.scans else 0}
     known = np.isfinite(truth).all(axis=1)
     if known.any():
         figures |= pose_figures(mean[known], P[known], truth[known], run.coordinates)
@@ -176,7 +176,7 @@ def robot_figures(run: Recording, name: str) -> dict[str, Any]:
     return figures
 
 
-def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world") -> dict[str, Any]:
+def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world") -> Figures:
     """Return errors and NEES of a path (N, 3) with covariances (N, 3, 3) against true poses (N, 3) in one frame.
 
     In space poses are (N, 7) and covariances (N, 6, 6).
@@ -212,7 +212,7 @@ def sees_no_scale(run: Recording, name: str) -> bool:
     )  # fmt: skip
 
 
-def free_scale_figures(mean: Array, P: Array, truth: Array) -> dict[str, Any]:
+def free_scale_figures(mean: Array, P: Array, truth: Array) -> Figures:
     """Return the figures of a path (N, 7) that compare it with the truth in units of its sigmas (N, 6, 6).
 
     The covariance is of a world whose scale begins with a guess, so there is no NEES; it has diverged if it does after
@@ -248,7 +248,7 @@ def known_landmarks(run: Recording) -> MapLandmarks:
     return replace(run.landmarks, ids=[names.get(i, i) for i in run.landmarks.ids])
 
 
-def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
+def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> Figures:
     """Return the landmark errors, raw and after their own rigid alignment, over the ids that map and truth share.
 
     Those known exactly do not count.  Points that are not Euclidean yet count if they are known to a hundredth of the
@@ -278,7 +278,7 @@ def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
     }
 
 
-def line_figures(landmarks: MapLandmarks, truth: Truth) -> dict[str, Any]:
+def line_figures(landmarks: MapLandmarks, truth: Truth) -> Figures:
     """Return the distances of the true ends of lines from the estimated lines, over those with a settled place.
 
     Across the lines: along them nothing is known.  Nothing is aligned.
@@ -344,7 +344,7 @@ def fix_distances(run: Recording, robot: str) -> Array:
     return np.linalg.norm(to_fixes(antenna) - xy, axis=1)
 
 
-def fix_figures(distance: Array) -> dict[str, Any]:
+def fix_figures(distance: Array) -> Figures:
     """Return the median, the RMS of those within 10 m and their share of all, for distances (N,) in metres."""
     near = distance[distance <= FIX_NEAR_M]
     return {
@@ -357,9 +357,8 @@ def fix_figures(distance: Array) -> dict[str, Any]:
 
 def nis_per_dof(history: History) -> float:
     """Return the sum of the normalised innovations squared of the associated observations over their dimensions."""
-    used = history.outcome == "associated"
-    value, dof = nis(history.z[used], history.Z[used])
-    return float(np.nansum(value) / dof.sum()) if dof.sum() else float("nan")
+    value, dof, _ = associated_nis(history)
+    return float(value.sum() / dof.sum()) if len(dof) else float("nan")
 
 
 def none_for_nan(value: Any) -> Any:

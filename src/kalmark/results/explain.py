@@ -16,6 +16,7 @@ from kalmark.report import Candidate
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.filter_description import observed_points
 from kalmark.results.history import History, Ints, LandmarkChange
+from kalmark.results.measures import place_sigma
 from kalmark.results.recording import Recording
 
 AROUND_S = 1.0  # before the first and after the last scan, a time still means them
@@ -66,11 +67,11 @@ class Explanation:
     def lines(self) -> Iterator[str]:
         """Yield the lines of its text."""
         d = 3 if len(self.pose) == 7 else 2
-        sigma = math.sqrt(max(np.trace(self.covariance[:d, :d]) / d, 0.0))
         at = ", ".join(f"{x:.2f}" for x in self.pose[:d])
         when = f"t = {self.t_s:.3f} s ({self.in_log} s in the log)"
         yield f"{self.robot} · {self.sensor or 'no sensor'} · {when}{'; ' if self.asked else ''}{self.asked}"
-        yield f"then at ({at}) m, sigma {sigma:.3g} m; {count(len(self.fates), 'observation')}"
+        sigma, seen = place_sigma(self.covariance, d), count(len(self.fates), "observation")
+        yield f"then at ({at}) m, sigma {sigma:.3g} m; {seen}"
         if self.gates is not None:
             near, far = self.gates
             yield f"paired where d2 is at most {near:.2f}, a new landmark where it is above {far:.2f} from all"

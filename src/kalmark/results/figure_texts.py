@@ -12,6 +12,8 @@ from collections.abc import Iterator, Mapping
 from importlib import resources
 from typing import Any
 
+Figures = dict[str, Any]  # by their keys in ``summary.json``
+Summary = Mapping[str, Any]  # figures that are read
 Words = tuple[tuple[str, str, str], ...]
 
 
@@ -22,7 +24,7 @@ TOTALS, MORE, ROBOT, BATCH = (
 )
 
 
-def rows_with_labels(figures: Mapping[str, Any], words: Words) -> Iterator[tuple[str, str, Any, str]]:
+def rows_with_labels(figures: Summary, words: Words) -> Iterator[tuple[str, str, Any, str]]:
     """Yield key, label, value and unit of each figure in the order of the words; last, by its key, what has none."""
     known = {key: (label, unit) for key, label, unit in words}
     for key in [*(key for key in known if key in figures), *(key for key in figures if key not in known)]:
@@ -34,7 +36,7 @@ DIFFERENCE_TITLE = "Difference of the poses from the batch solution"
 DIFFERENCE_COLUMNS = ("robot", "from s", "to s", "sigmas of the filter")
 
 
-def difference_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def difference_rows(summary: Summary) -> list[tuple[str, ...]]:
     """Return the differences of the poses over time that a comparison with the batch solution has, as a table."""
     rows = summary.get("batch", {}).get("pose_differences", ())
     return [(r["robot"], *(f"{r[key]:.1f}" for key in ("start_s", "end_s")), figure(r["sigmas"])) for r in rows]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -25,6 +25,7 @@ from kalmark.slam.held_control import bias_name
 
 if TYPE_CHECKING:
     from kalmark.report import Report
+    from kalmark.slam.robot import Mount, Robot
     from kalmark.slam.slam import Slam
 
 HALF_VIEW = 0.8  # tangent of half the angle that is drawn of a camera that has no focal length
@@ -38,8 +39,8 @@ def configuration(slam: Slam, log: Log, known: str | None = None) -> dict[str, A
     `known` is the file of the landmarks that were in the map before the first event.
     """
     said: dict[str, Any] = {}
-    mounts = [mount for robot in slam.robots.values() for mount in robot.sensors.values()]
-    models = [each for part in (slam.state.settings, *slam.robots.values(), *mounts) for each in vars(part).values()]
+    parts = (slam.state.settings, *slam.robots.values(), *mounts_of(slam.robots).values())
+    models = [each for part in parts for each in vars(part).values()]
     own: list[Any] = [type(each) for each in models if not isinstance(each, np.ndarray | np.generic)]
     if log.path is not None:
         said["log"] = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
@@ -68,16 +69,19 @@ class Focal(Protocol):
     cy_px: float
 
 
+def mounts_of(robots: Mapping[str, Robot]) -> dict[tuple[str, str], Mount]:
+    """Return the mounts of robots' sensors, by robot and sensor."""
+    return {(robot.name, name): m for robot in robots.values() for name, m in robot.sensors.items()}
+
+
 def cameras(slam: Slam) -> tuple[Camera, ...]:
     """Return the sensors of a filter that measure pixels of an image of known size; mounts in the map as estimated."""
     found = []
-    for robot in slam.robots.values():
-        for name, mount in robot.sensors.items():
-            sensor, columns = mount.sensor, tuple(mount.sensor.columns)
-            if columns[0].endswith("_px") and isinstance(sensor, Imaging):
-                at = mount_now(slam, robot.name, name, mount.at)
-                size = (float(sensor.width_px), float(sensor.height_px))
-                found.append(Camera(robot.name, name, at, size, columns, _corners(sensor)))
+    for (robot, name), mount in mounts_of(slam.robots).items():
+        sensor, columns = mount.sensor, tuple(mount.sensor.columns)
+        if columns[0].endswith("_px") and isinstance(sensor, Imaging):
+            size = (float(sensor.width_px), float(sensor.height_px))
+            found.append(Camera(robot, name, mount_now(slam, robot, name), size, columns, _corners(sensor)))
     return tuple(found)
 
 
@@ -85,16 +89,13 @@ def sensors(slam: Slam) -> tuple[Measuring, ...]:
     """Return the sensors of a filter that are no cameras."""
     seen = {(camera.robot, camera.sensor) for camera in cameras(slam)}
     return tuple(
-        Measuring(robot.name, name, tuple(mount.sensor.columns))
-        for robot in slam.robots.values()
-        for name, mount in robot.sensors.items()
-        if (robot.name, name) not in seen
+        Measuring(*key, tuple(mount.sensor.columns)) for key, mount in mounts_of(slam.robots).items() if key not in seen
     )
 
 
 def calibrated_mounts(slam: Slam) -> tuple[CalibratedMount, ...]:
     """Return the mounts of the sensors that calibrate themselves, as estimated and as given."""
-    named = {f"{robot.name}.{key}": mount for robot in slam.robots.values() for key, mount in robot.sensors.items()}
+    named = {".".join(key): mount for key, mount in mounts_of(slam.robots).items()}
     return tuple(
         CalibratedMount(
             name, mean, slam.covariance(name), block[2], parameter_names(mount.sensor)[: len(mean) - len(mount.at)]
@@ -121,9 +122,9 @@ def _in_map(slam: Slam, name: str) -> bool:
     return True
 
 
-def mount_now(slam: Slam, robot: str, sensor: str, at: Any) -> Array:
+def mount_now(slam: Slam, robot: str, sensor: str) -> Array:
     """Return the mount of a sensor: as given, or as estimated so far if its mount is in the map."""
-    name = f"{robot}.{sensor}"
+    name, at = f"{robot}.{sensor}", slam.robots[robot].sensors[sensor].at
     return np.array(slam.mean(name)[: len(at)] if _in_map(slam, name) else at, dtype=np.float64)
 
 
@@ -134,15 +135,14 @@ def observed_points(slam: Slam, robot: str, sensor: str, pose: Array, y: Array) 
     """
     d = 3 if len(pose) == 7 else 2
     out = np.full((len(y), d), np.nan)
-    mount = slam.robots[robot].sensors[sensor]
-    model = mount.sensor
+    model = slam.robots[robot].sensors[sensor].sensor
     known = np.flatnonzero(np.isfinite(y[:, : len(model.columns)]).all(axis=1))
     if not len(known) or not isinstance(model, FullSensor) or not finds_depth(model):
         return out
     v = model.invert(np.ascontiguousarray(y[known, : len(model.columns)]))[0]
     if v.shape[1] == LINE or isinstance(model, SegmentVisible):  # a line is nowhere in particular
         return out
-    at = mount_now(slam, robot, sensor, mount.at)
+    at = mount_now(slam, robot, sensor)
     out[known] = as_rigid(pose[: len(at)])(as_rigid(at)(v[:, :d]))
     return out
 
@@ -175,16 +175,16 @@ def residual_px(slam: Slam, scan: Scan, report: Report) -> Array:
 
     `slam` is the filter just after the scan; an observation that it did not use has NaN, too.
     """
-    left, mount = np.full(len(report.observations), np.nan), slam.robots[scan.robot].sensors[scan.sensor]
+    left, sensor = np.full(len(report.observations), np.nan), slam.robots[scan.robot].sensors[scan.sensor].sensor
     used = [o for o in report.observations if o.outcome in USED]
-    if not used or not isinstance(mount.sensor, TagCorners):
+    if not used or not isinstance(sensor, TagCorners):
         return left
-    at = mount_now(slam, scan.robot, scan.sensor, mount.at)
+    at = mount_now(slam, scan.robot, scan.sensor)
     tags = np.array([slam.mean(o.landmark)[:7] for o in used])  # type: ignore[arg-type]
     v = tag_seen_from(compose(slam.mean(scan.robot)[:7], at)[0], tags)[0]
     rows = [o.index for o in used]
-    y, par = scan.y[rows], np.array(mount.sensor.parameters)
-    e = project_corners(mount.sensor.code, v, np.ascontiguousarray(y[:, 8]), par)[0]
+    y, par = scan.y[rows], np.array(sensor.parameters)
+    e = project_corners(sensor.code, v, np.ascontiguousarray(y[:, 8]), par)[0]
     rms = np.sqrt(0.25 * np.sum((y[:, :8] - e) ** 2, axis=1))
     left[rows] = np.nan_to_num(rms, nan=np.inf)  # behind the camera
     return left

@@ -17,7 +17,7 @@ from kalmark.results.filter_description import cameras, mount_now, observed_poin
 from kalmark.results.history import RobotStart
 from kalmark.results.landmark_table import MapLandmarks, shapes
 from kalmark.results.measures import Rigid
-from kalmark.results.scene import Ray, Scene, drawn_box, places_of
+from kalmark.results.scene import Ray, Scene, Way, drawn_box, places_of
 from kalmark.results.truth import ORIGIN, as_rigid, frame_offset, landmarks_of_size, move_landmarks
 
 if TYPE_CHECKING:
@@ -86,32 +86,25 @@ def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any
     d = 3 if whole.in_space else 2
     size = 3 if d == 2 else 7
     exact = whole.split()[1]
-    if world:
-        robots = np.array([slam.covariance(name)[:d, :d] for name in names])
-    else:
+    robots = np.array([slam.covariance(name)[:d, :d] for name in names])
+    if not world:
         whole, robots = whole.shape(slam, names)
     mapped = whole.split()[0]
     drawn, known = shapes(*mapped.places(), mapped.kinds, d), exact.positions()[0][:, :d]
-    poses = {name: slam.mean(name)[:size] for name in names}
-    before = _poses_by_robot(path, names, size, "path")
-    ways = {name: np.vstack([before.get(name, np.empty((0, size))), pose]) for name, pose in poses.items()}
+    before, nothing = _poses_by_robot(path, names, size, "path"), np.empty((0, size))
     true, landmarks = truth_until_now(slam, truth, size)
-    shown = [*(way[:, :d] for way in (*ways.values(), *true.values())), *places_of(landmarks, d), known]
-    ends = {name: (pose, P) for (name, pose), P in zip(poses.items(), robots, strict=True)}
+    ways = {
+        name: _way(np.vstack([before.get(name, nothing), slam.mean(name)[:size]]), P[None], true.get(name, nothing))
+        for name, P in zip(names, robots, strict=True)
+    }
+    shown = [part[:, :d] for way in ways.values() for part in (way.path, way.truth)] + [*places_of(landmarks, d), known]
+    ends = np.array([way.path[-1, :d] for way in ways.values()])
     rays = tuple(ray for report in reports for ray in rays_of(slam, report)) if picture.sensors else ()
     shown += [np.array([ray.seen_at for ray in rays]).reshape(-1, d)]
-    low, high = drawn_box(np.empty((0, d)), ends, drawn, shown, picture)
-    most = max(map(len, (*ways.values(), *true.values())))
+    low, high = drawn_box(nothing[:, :d], ends, robots, drawn, shown, picture)
     return Scene(
         d=d,
-        paths=ways,
-        pose_covariances={name: P[None] for name, (_, P) in ends.items()},
-        stretches=dict.fromkeys(names, np.zeros(most, dtype=np.int64)),
-        dotted={name: np.zeros(len(way), dtype=np.bool_) for name, way in ways.items()},
-        dead={},
-        truth=true,
-        fixes={},
-        used={},
+        ways=ways,
         true_landmarks=landmarks,
         ids=tuple(mapped.ids),
         shapes=drawn,
@@ -130,14 +123,19 @@ def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any
     )
 
 
+def _way(path: Array, P: Array, truth: Array) -> Way:
+    """Return a way without gaps, dead reckoning and fixes."""
+    gaps, nothing = np.zeros(max(len(path), len(truth)), dtype=np.int64), np.empty((0, P.shape[1]))
+    return Way(path, P, gaps, gaps > 0, nothing, truth, nothing, nothing)
+
+
 def rays_of(slam: Slam, report: Report) -> list[Ray]:
     """Return the observations of the last scan of a filter, with the places of its robot and landmarks now."""
     scan = report.event
     if not isinstance(scan, Scan) or not len(report.y):
         return []
-    pose, mount = slam.mean(scan.robot), slam.robots[scan.robot].sensors[scan.sensor]
-    d = slam.place(scan.robot)[0].size
-    at = mount_now(slam, scan.robot, scan.sensor, mount.at)
+    pose, d = slam.mean(scan.robot), slam.place(scan.robot)[0].size
+    at = mount_now(slam, scan.robot, scan.sensor)
     sensor = as_rigid(pose[: len(at)])(at[:d])
     seen_at = observed_points(slam, scan.robot, scan.sensor, pose[: 3 if d == 2 else 7], report.y)
     return [Ray(o.outcome, sensor, seen_at[o.index], _place(slam, o.landmark, d)) for o in report.observations]

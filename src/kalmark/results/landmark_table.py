@@ -24,7 +24,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -260,11 +260,9 @@ class MapLandmarks:
 
     def _of(self, rows: list[int]) -> MapLandmarks:
         """Return the landmarks of these rows."""
-        return MapLandmarks(
-            [self.ids[k] for k in rows], [self.kinds[k] for k in rows], [self.means[k] for k in rows],
-            [self.covariances[k] for k in rows], [self.observations[k] for k in rows], self.in_space, self.exact,
-            self.log_odds, self.unseen,
-        )  # fmt: skip
+        lists: list[list[Any]] = [self.ids, self.kinds, self.means, self.covariances, self.observations]
+        ids, kinds, means, covariances, observations = ([values[k] for k in rows] for values in lists)
+        return replace(self, ids=ids, kinds=kinds, means=means, covariances=covariances, observations=observations)
 
     def positions(self) -> tuple[Array, Array]:
         """Return the positions (K, d) and their covariances (K, d, d), of lines their first endpoints."""

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Event, kind_of, label_of_event, seconds_text, short_text
@@ -21,6 +21,7 @@ from kalmark.logs.json_lines import LONGEST_LINE, event_of_object, mapping_of
 from kalmark.report import Report
 from kalmark.slam.slam import Slam
 
+Answer = dict[str, Any]  # as JSON
 PIECE = 1 << 16  # bytes that are read at once
 
 
@@ -38,7 +39,7 @@ class Live:
         self.slam, self.number, self.lost = slam, 0, ""
         self.changing = nullcontext() if changing is None else changing
 
-    def ready(self) -> dict[str, Any]:
+    def ready(self) -> Answer:
         """Return the message before the first line: the robots, and the columns of their controls and sensors."""
         robots = {
             name: {
@@ -49,7 +50,7 @@ class Live:
         }
         return {"ready": True, "robots": robots}
 
-    def answer(self, line: str) -> dict[str, Any]:
+    def answer(self, line: str) -> Answer:
         """Return the answer to a line: the estimate after its event, the map if it requests it, or an error."""
         self.number += 1
         head = {"line": self.number}
@@ -75,9 +76,9 @@ class Live:
             raise EventError(f"{label_of_event(event)}: a second one of {whose} at this time, expected each event once")
         return self.slam.process(event)
 
-    def estimate(self, event: Event, report: Report) -> dict[str, Any]:
+    def estimate(self, event: Event, report: Report) -> Answer:
         """Return the robot's mean and covariance after an event, and what became of its observations."""
-        out: dict[str, Any] = {"t_ns": event.t_ns, "t_s": float(seconds_text(event.t_ns)), "robot": event.robot}
+        out: Answer = {"t_ns": event.t_ns, "t_s": float(seconds_text(event.t_ns)), "robot": event.robot}
         out |= {"mean": self.slam.mean(event.robot).tolist(), "covariance": self.slam.covariance(event.robot).tolist()}
         if report.observations:
             seen = (o._asdict() for o in report.observations)
@@ -93,17 +94,10 @@ class Live:
             out["replaced_m"] = report.replaced
         return out
 
-    def landmarks(self) -> list[dict[str, Any]]:
+    def landmarks(self) -> list[Answer]:
         """Return the map: id, kind, mean, covariance and number of observations of each landmark."""
         rows = (row._asdict() for row in self.slam.landmarks())
         return [row | {"mean": row["mean"].tolist(), "covariance": row["covariance"].tolist()} for row in rows]
-
-
-class Lines(Protocol):
-    """A source of lines of text."""
-
-    def readline(self, most: int, /) -> str:
-        """Return the next line, or `most` characters of it; "" at the end."""
 
 
 class Incoming:
@@ -165,13 +159,15 @@ class Incoming:
                 return False
 
 
-def converse(live: Live, incoming: Lines, outgoing: TextIO, after: Callable[[], object] = lambda: None) -> None:
+def converse(
+    live: Live, incoming: TextIO | Incoming, outgoing: TextIO, after: Callable[[], object] = lambda: None
+) -> None:
     """Answer each line until there are no more, or the filter is lost; blank lines have no answer.
 
     `after` is called after each answer.
     """
 
-    def send(answer: dict[str, Any]) -> None:
+    def send(answer: Answer) -> None:
         outgoing.write(json.dumps(answer, allow_nan=False) + "\n")
         outgoing.flush()
 

@@ -20,7 +20,7 @@ from kalmark.filter import kernels
 from kalmark.geometry.angles import exponential_v, wrap
 from kalmark.geometry.gaussian import quantile
 from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inverse, log, multiply
-from kalmark.results.history import Ints
+from kalmark.results.history import History, Ints
 
 SINGULAR = 1e-12  # 1 / tr C^-1, at most the smallest eigenvalue of a correlation matrix C, up to which it is singular
 FEW = 8  # numbers of an error up to which a Cholesky factor takes less time without LAPACK
@@ -130,6 +130,18 @@ def rmse(errors: Array) -> float:
 def aligned_rmse(estimate: Array, truth: Array) -> float:
     """Return the RMSE of positions (N, d) after the rigid alignment that makes it least."""
     return rmse(rigid(estimate, truth)(estimate) - truth)
+
+
+def sigmas(P: Array) -> Array:
+    """Return the sigmas (..., n) of covariances (..., n, n): 0 of a variance that rounding made negative."""
+    out: Array = np.sqrt(np.maximum(np.einsum("...ii->...i", P), 0.0))
+    return out
+
+
+def place_sigma(P: Array, d: int) -> Array:
+    """Return the sigma (...) of a coordinate, on average, of covariances (..., n, n) that begin with a place (d,)."""
+    out: Array = np.sqrt(np.maximum(np.trace(P[..., :d, :d], axis1=-2, axis2=-1) / d, 0.0))
+    return out
 
 
 def path_m(positions: Array) -> float:
@@ -329,6 +341,13 @@ def nis(z: Array, Z: Array) -> tuple[Array, Ints]:
         rows = dof == m
         value[rows] = nees(z[rows, :m], Z[rows, :m, :m])
     return value, np.where(np.isfinite(value), dof, 0)
+
+
+def associated_nis(history: History) -> tuple[Array, Ints, Ints]:
+    """Return the NIS, its degrees of freedom and the step (K,) of each associated observation whose Z is regular."""
+    used = history.outcome == "associated"
+    value, dof = nis(history.z[used], history.Z[used])
+    return value[dof > 0], dof[dof > 0], history.step[used][dof > 0]
 
 
 def truncated_variance(gate: float, dof: int) -> float:

@@ -34,6 +34,7 @@ from kalmark.results.scene import (
     OUTCOME_COLOURS,
     TRUTH_COLOUR,
     Scene,
+    Style,
     break_path,
     join_polylines,
     picture_of,
@@ -63,7 +64,7 @@ WINDOW = 0.7  # half of the picture from behind a robot, by the distance of the 
 NEAREST = 0.1  # what is nearer to the eye than this part of the distance of the middle is not drawn
 FEW = 40  # landmarks of space that are labelled
 GROUND, SHADOW, TICK, SOFT = "#d7dbe1", "#c3c8d0", "#7a818c", "#555b66"
-NAMED: dict[str, Any] = {"color": "#1e4d2b", "fontsize": 7, "zorder": 9}
+NAMED: Style = {"color": "#1e4d2b", "fontsize": 7, "zorder": 9}
 POSE_COLOUR = "#d62f2f"
 ALARM_COLOUR = "#b3261e"
 KNOWN_COLOUR = "#2f7d4f"
@@ -75,9 +76,9 @@ class Stroke(NamedTuple):
     """Polylines or marks: points (N, d), NaN between lines, their style, and the label and style in the legend."""
 
     points: Array
-    style: dict[str, Any]
+    style: Style
     label: str = ""
-    sample: dict[str, Any] | None = None
+    sample: Style | None = None
 
 
 def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim: bool = True) -> None:
@@ -98,7 +99,7 @@ def save_figure(figure: Figure, path: str | PathLike[str], dpi: float = 130, rim
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing")  # of a name in a script that the font does not have
         box = None if not rim else "tight" if laid_out else figure.get_tightbbox().padded(0.15)
-        style: dict[str, Any] = {"bbox_inches": box, "pad_inches": 0.15}
+        style: Style = {"bbox_inches": box, "pad_inches": 0.15}
         style |= {"pil_kwargs": {"compress_level": 3}} if ending == "png" else {}
         replace_file(path, partial(figure.savefig, dpi=dpi, format=ending, **style))
 
@@ -144,7 +145,7 @@ def draw_map(
     at = (width - 0.15 - wide if scene.d == 3 else left) / width, below / height, wide / width, tall / height
     draw_plan(figure.add_axes(at, anchor="NW"), scene)
     figure.text(left / width, 1 - 0.3 / height, title, fontsize=13, fontweight="bold", color=INK)
-    text: dict[str, Any] = {"va": "top", "fontsize": 9, "color": SOFT, "linespacing": 1.35}
+    text: Style = {"va": "top", "fontsize": 9, "color": SOFT, "linespacing": 1.35}
     figure.text(left / width, 1 - 0.4 / height, "\n".join(lines), **text)
     below_lines = 1 - (0.4 + LINE_INCHES * len(lines)) / height
     figure.text(left / width, below_lines, "\n".join(alarms), **text | {"color": ALARM_COLOUR})
@@ -188,21 +189,19 @@ def draw_plan(axes: Axes, scene: Scene) -> None:
 
 def strokes(scene: Scene) -> list[Stroke]:
     """Return all that is drawn of a scene, in the order of the legend."""
-    several, crowded = len(scene.paths) > 1, len(scene.ids) > CROWD
-    gaps = " (dotted: no scans, or lost)" if any(way.any() for way in scene.dotted.values()) else ""
+    several, crowded = len(scene.ways) > 1, len(scene.ids) > CROWD
+    gaps = " (dotted: no scans, or lost)" if any(way.dotted.any() for way in scene.ways.values()) else ""
     out = []
-    for robot, path in scene.paths.items():
-        style = {"color": scene.colour(robot), "linewidth": 0.8 if len(path) > LONG else 1.2, "alpha": 0.9, "zorder": 6}
+    for robot, way in scene.ways.items():
+        thick = 0.8 if len(way.path) > LONG else 1.2
+        style = {"color": scene.colour(robot), "linewidth": thick, "alpha": 0.9, "zorder": 6}
         label = robot if several else f"estimated path{gaps}"
         out.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
         out.append(Stroke(scene.bridges(robot), style | {"linestyle": ":"}))
-    out += _true_paths(scene) if scene.picture.truth else []
-    small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
-    aligned = "position fixes (aligned, not used)"
-    out += [Stroke(fixes, small, aligned, small | {"markersize": 6}) for fixes in scene.fixes.values()]
-    out += [Stroke(fixes, cross, "fixes used", cross | {"markersize": 5}) for fixes in scene.used.values()]
     out += (
-        (_true_strokes(scene, crowded) if scene.picture.truth else [])
+        (_true_paths(scene) if scene.picture.truth else [])
+        + _fix_strokes(scene)
+        + (_true_strokes(scene, crowded) if scene.picture.truth else [])
         + _known_strokes(scene)
         + _landmark_strokes(scene, crowded)
         + _robot_strokes(scene)
@@ -214,21 +213,29 @@ def strokes(scene: Scene) -> list[Stroke]:
     if len(scene.repeats):
         twice = {"color": ALARM_COLOUR, "linewidth": 0.9, "alpha": 0.8, "zorder": 5}
         out.append(Stroke(scene.repeats, twice, "landmarks mapped twice", twice))
-    for robot, path in scene.dead.items():
+    for robot, way in scene.ways.items():
         dead = {"color": scene.colour(robot), "linewidth": 0.7, "alpha": 0.5, "linestyle": (0, (5, 3)), "zorder": 3}
-        if np.isfinite(path).any():
-            out.append(Stroke(break_path(path, scene.stretches[robot]), dead, "dead reckoning", dead))
+        if np.isfinite(way.dead).any():
+            out.append(Stroke(break_path(way.dead, way.stretches), dead, "dead reckoning", dead))
     return out
 
 
-def _true_style(scene: Scene) -> dict[str, Any]:
+def _fix_strokes(scene: Scene) -> list[Stroke]:
+    small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
+    told = "position fixes (aligned, not used)"
+    fixes = [Stroke(way.fixes, small, told, small | {"markersize": 6}) for way in scene.ways.values()]
+    fixes += [Stroke(way.used, cross, "fixes used", cross | {"markersize": 5}) for way in scene.ways.values()]
+    return [stroke for stroke in fixes if len(stroke.points)]
+
+
+def _true_style(scene: Scene) -> Style:
     return {"color": scene.picture.colour("truth", TRUTH_COLOUR), "linewidth": 2.3, "alpha": 0.6, "zorder": 2}
 
 
 def _true_paths(scene: Scene) -> list[Stroke]:
-    style, label = _true_style(scene), f"true path{'s' if len(scene.paths) > 1 else ''}{scene.how}"
-    ways = {robot: way[:, : scene.d] for robot, way in scene.truth.items() if len(way) > 1}
-    return [Stroke(break_path(way, scene.stretches[robot]), style, label, style) for robot, way in ways.items()]
+    style, label = _true_style(scene), f"true path{'s' if len(scene.ways) > 1 else ''}{scene.how}"
+    ways = [(way.truth[:, : scene.d], way.stretches) for way in scene.ways.values() if len(way.truth) > 1]
+    return [Stroke(break_path(*way), style, label, style) for way in ways]
 
 
 def _true_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
@@ -284,7 +291,8 @@ def _robot_strokes(scene: Scene) -> list[Stroke]:
     """Return starts, ends with their contours, and in space the robots' bodies along the way."""
     starts, ends, rings, d = [], [], [], scene.d
     disc = {"markerfacecolor": "white"}
-    for robot, path in scene.paths.items():
+    for robot, way in scene.ways.items():
+        path = way.path
         if not len(path):
             continue
         colour = scene.colour(robot)
@@ -292,7 +300,7 @@ def _robot_strokes(scene: Scene) -> list[Stroke]:
         if len(path) > 1 or scene.end == "end":
             starts.append(Stroke(path[:1, :d], rim | disc, "start", _marks("o", INK, 6, 1) | disc))
         ends.append(_robot_mark(scene, path[-1], colour, scene.end, 8))
-        ring = scene.rings(path[-1:, :d], scene.pose_covariances[robot][-1:])
+        ring = scene.rings(path[-1:, :d], way.covariances[-1:])
         style = {"color": colour if d == 2 else POSE_COLOUR, "linewidth": 0.9, "zorder": 7}
         said = f"{scene.end}{scene.how_large()}" if scene.how_large() else ""
         rings.append(Stroke(ring, style, said, style | {"color": INK if d == 2 else POSE_COLOUR}))
@@ -330,7 +338,7 @@ def _ray_strokes(scene: Scene) -> list[Stroke]:
     return out
 
 
-def _marks(marker: Any, colour: str, size: float, zorder: float) -> dict[str, Any]:
+def _marks(marker: Any, colour: str, size: float, zorder: float) -> Style:
     return {"linestyle": "", "marker": marker, "color": colour, "markersize": size, "zorder": zorder}
 
 
@@ -371,7 +379,7 @@ class Projection:
         view = scene.picture.view if view is None else view
         middle, far = (scene.low + scene.high) / 2, 2.5 * float(np.linalg.norm(scene.high - scene.low))
         if view == "self":
-            pose = next(path[-1] for path in scene.paths.values())
+            pose = next(way.path[-1] for way in scene.ways.values())
             ahead = matrix(np.ascontiguousarray(pose[3:7]))[:, 0]
             elevation, turned, share = BEHIND
             degrees = elevation, turned + float(np.degrees(np.arctan2(ahead[1], ahead[0])))
@@ -429,7 +437,7 @@ def draw_space(axes: Axes, scene: Scene, projection: Projection) -> None:
 def _shadows(scene: Scene) -> Stroke:
     """Return the paths on the ground, and lines from few landmarks down to it."""
     floor = scene.ground
-    shadows = [np.column_stack([line[:, :2], np.full(len(line), floor)]) for line in map(scene.line, scene.paths)]
+    shadows = [np.column_stack([line[:, :2], np.full(len(line), floor)]) for line in map(scene.line, scene.ways)]
     if len(scene.ids) <= CROWD:
         standing = scene.shapes.means[scene.shapes.group != LINES]
         shadows += [np.array([point, [*point[:2], floor]]) for point in standing]

@@ -8,7 +8,7 @@ e are what the filter expected, of landmarks in view that were not measured, too
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,7 +20,7 @@ from kalmark.geometry.gaussian import ellipses
 from kalmark.picture_options import Picture
 from kalmark.results.history import History, Measuring
 from kalmark.results.labels import name_points
-from kalmark.results.scene import IN_VIEW, INK
+from kalmark.results.scene import IN_VIEW, INK, Style
 
 ACROSS = ("bearing_rad", "azimuth_rad", "y_m")  # columns to be drawn from right to left, the first that there is,
 AHEAD = ("range_m", "x_m")  # and upwards
@@ -117,7 +117,7 @@ def _draw(axes: Axes, e: Array, Z: Array, colour: str, style: str) -> None:
 def _legend(used: Flags, e: Array, missed: int, colours: tuple[str, str, str, str]) -> list[Line2D]:
     mark, used_colour, unused, unmeasured = colours
     expected, line = np.isfinite(e).all(axis=1), "expected, $3\\sigma$"
-    cross: dict[str, Any] = {"ls": "", "marker": "+", "mew": 1.4}
+    cross: Style = {"ls": "", "marker": "+", "mew": 1.4}
     out = [Line2D([], [], color=mark, **cross, label="measured")]
     if (expected & used).any():
         out.append(Line2D([], [], color=used_colour, label=f"{line}, used"))

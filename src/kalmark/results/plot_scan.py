@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 
 from kalmark.arrays import Array
 from kalmark.errors import RunError
+from kalmark.geometry.gaussian import contours
 from kalmark.picture_options import Picture
 from kalmark.results.camera_images import Pictures
 from kalmark.results.explain import Explanation, Fate
@@ -29,9 +30,9 @@ from kalmark.results.scene import (
     OUTCOME_COLOURS,
     Image,
     Sighting,
+    Style,
     clip_line,
     colour_of,
-    contours,
     images,
     join_polylines,
     picture_of,
@@ -45,7 +46,7 @@ ON_IMAGE = "#ffd400"  # of what was measured, over a picture
 MOST_NAMES = 30  # of landmarks, over a picture
 PAPER = 490.0  # width of the axes in points, about
 MARK = 6.0  # half a cross or a square, in points
-ON_LINE: dict[str, Any] = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
+ON_LINE: Style = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 MEASURED, SEGMENT, NAME = "#7d838d", "#3a68c8", "#1e4d2b"
 
 
@@ -96,7 +97,7 @@ def _observations(axes: Axes, told: Explanation, low: Array, high: Array) -> Non
         labels.beside(at, _label(fate), fontsize=9, color=colour)
         for other in fate.near:
             chosen = other.landmark == fate.landmark
-            style: dict[str, Any] = {"ls": "-", "lw": 2} if chosen else {"ls": ":", "lw": 1}
+            style: Style = {"ls": "-", "lw": 2} if chosen else {"ls": ":", "lw": 1}
             axes.plot(*zip(at, other.place[:2], strict=True), color=colour, **style)
     for name, place in squares.items():
         labels.beside(place, name, fontsize=8, color=INK)
@@ -138,7 +139,7 @@ class _Labels:
         places = [begin + parts * way + side * off * across for side in (0.0, 1.0, -1.0)]
         self._put(np.concatenate(places), text, style)
 
-    def _put(self, centres: Array, text: str, style: dict[str, Any]) -> None:
+    def _put(self, centres: Array, text: str, style: Style) -> None:
         half = _half(text, style["fontsize"])
         boxes = np.hstack([centres - half, centres + half])[:, None]
         sides = np.minimum(boxes[..., 2:], self.taken[:, 2:]) - np.maximum(boxes[..., :2], self.taken[:, :2])
@@ -171,7 +172,7 @@ def _extent(told: Explanation) -> tuple[Array, Array]:
 
 def _legend(told: Explanation) -> list[Line2D]:
     outcomes = {f.outcome: ": d2" if ":" in _label(f) else "" for f in told.fates}
-    mark: dict[str, Any] = {"ls": "", "marker": "x", "mew": 2}
+    mark: Style = {"ls": "", "marker": "x", "mew": 2}
     marks = [Line2D([], [], **mark, color=OUTCOME_COLOURS.get(o, INK), label=f"{o}{d2}") for o, d2 in outcomes.items()]
     return [
         Line2D([], [], color=ROBOT, marker="o", label="robot after the scan, 3 sigma of the shape"),
@@ -267,7 +268,7 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, optio
 
 
 def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: str, rejected: bool) -> None:
-    style: dict[str, Any] = {"color": colour, "linewidth": 1.1, "linestyle": "--" if rejected else "-", "zorder": 5}
+    style: Style = {"color": colour, "linewidth": 1.1, "linestyle": "--" if rejected else "-", "zorder": 5}
     if len(s.expected) == 1:
         axes.plot(*s.expected.T, ".", color=colour, markersize=3, zorder=5)
         if np.isfinite(s.Z).all():
@@ -286,13 +287,13 @@ def legend(seen: list[Image], options: Picture) -> list[Line2D]:
     """Return the entries of the legend: only what there is."""
     sightings = [s for image in seen for s in image.sightings]
     lines = any(len(s.measured) > 1 for s in sightings)
-    mark: dict[str, Any] = {"linewidth": 3, "alpha": 0.55} if lines else {"marker": "+", "linestyle": ""}
+    mark: Style = {"linewidth": 3, "alpha": 0.55} if lines else {"marker": "+", "linestyle": ""}
     colour = options.colour("measured", SEGMENT if lines else MEASURED)
     out = [Line2D([], [], color=colour, label="measured", **mark)]
     found = dict.fromkeys(colour_of(s, options) for s in sightings if np.isfinite(s.expected).all())
     out += [Line2D([], [], color=c, label=label if lines else f"{label}, 3σ") for c, label in sorted(found)]
     if any(s.outcome == "new" for s in sightings):
-        square: dict[str, Any] = {"marker": "s", "markerfacecolor": "none", "linestyle": ""}
+        square: Style = {"marker": "s", "markerfacecolor": "none", "linestyle": ""}
         out.append(Line2D([], [], color=NAME, label="new landmark", **square))
     if any(s.outcome == "rejected" for s in sightings):
         out.append(Line2D([], [], color=INK, marker="x", linestyle="", label="rejected"))

@@ -30,6 +30,7 @@ from kalmark.events import fixed_seconds, list_names, short_text
 from kalmark.files import hold_lock, read_arrays, refuse_aliases, replace_file, write
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of
+from kalmark.results.figure_texts import Figures
 from kalmark.results.history import History
 from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.truth import Truth
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from kalmark.logs.log import Log
     from kalmark.slam.slam import Slam
 
+Section = dict[str, Any]  # of a configuration
 ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
 CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
 FAST, PAYS = 1, 0.75  # the level of compression of ``history.npz``, and what it must leave at most to be used
@@ -106,7 +108,7 @@ def _savez(path: Path, arrays: Mapping[str, Any]) -> None:
             file.writestr(zipfile.ZipInfo(f"{name}.npy"), out.getbuffer(), how, FAST)  # without the clock
 
 
-def config_yaml(config: dict[str, Any]) -> str:
+def config_yaml(config: Section) -> str:
     """Return the text of ``config.yaml``: everything that was in force, headed by version and seed."""
     out = io.StringIO()
     head = {"version": version("kalmark"), "seed": config.get("seed")}
@@ -117,7 +119,7 @@ def config_yaml(config: dict[str, Any]) -> str:
     return out.getvalue()
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> Section:
     """Read a saved configuration.  Raises RunError if it is not a mapping."""
     config = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
     refuse_aliases(config, str(path), RunError)
@@ -146,7 +148,7 @@ class LogReference:
     path: str | None = None
     robots: tuple[str, ...] = ()
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> Figures:
         """Return the reference as it stands in ``summary.json``."""
         return vars(self) | {"robots": list(self.robots)}
 
@@ -163,7 +165,7 @@ class Recording:
     """
 
     history: History
-    config: dict[str, Any]
+    config: Section
     landmarks: MapLandmarks
     truth: Truth
     log: LogReference = LogReference()
@@ -174,8 +176,8 @@ class Recording:
     slam: Slam | None = None
     source: Log | None = None
     folder: Path | None = None
-    summary: dict[str, Any] = field(default_factory=dict)
-    reference: dict[str, Any] = field(default_factory=dict)
+    summary: Figures = field(default_factory=dict)
+    reference: Figures = field(default_factory=dict)
     trusted: bool = True
     known: str = ""
 
@@ -190,19 +192,19 @@ class Recording:
         value = self.config.get("estimator")
         return str(value.get("type", "")) if isinstance(value, dict) else str(value or "")
 
-    def section(self, robot: str, sensor: str) -> dict[str, Any]:
+    def section(self, robot: str, sensor: str) -> Section:
         """Return the configuration of a robot's sensor, {} if it has none."""
         return self.sections(robot).get(sensor) or {}
 
-    def motion(self, robot: str) -> dict[str, Any]:
+    def motion(self, robot: str) -> Section:
         """Return the configuration of a robot's motion, {} if it has none."""
         robots = self.config.get("robots") or {}
         return (robots.get(robot) or robots.get("each") or {}).get("motion") or {}
 
-    def sections(self, robot: str) -> dict[str, Any]:
+    def sections(self, robot: str) -> Section:
         """Return the configuration of a robot's sensors by name."""
         robots = self.config.get("robots") or {}
-        found: dict[str, Any] = {}
+        found: Section = {}
         for name in ("each", robot):
             found |= (robots.get(name) or {}).get("sensors") or {}
         return found

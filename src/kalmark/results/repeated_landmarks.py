@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kalmark.management.repeated_places import IN_A_REPEAT, find_repeats
-from kalmark.results.figure_texts import count, figure
+from kalmark.results.figure_texts import Figures, count, figure
 from kalmark.results.history import History, Repeated
 from kalmark.results.recording import Recording
 
@@ -28,7 +28,7 @@ def repeat_rows(slam: Slam) -> tuple[Repeated, ...]:
     )
 
 
-def repeat_figures(run: Recording) -> list[dict[str, Any]]:
+def repeat_figures(run: Recording) -> list[Figures]:
     """Return the repeats as they are in ``summary.json``, the surest first.
 
     `start_s` is when three landmarks of the newer part had been observed, in seconds of the log.
@@ -66,7 +66,7 @@ def _start_s(history: History, landmarks: list[str]) -> float | None:
     return float(history.t_ns[first[min(len(first), SOME) - 1]]) * 1e-9 if len(first) else None
 
 
-def repeat_warnings(found: list[dict[str, Any]]) -> Iterator[str]:
+def repeat_warnings(found: list[Figures]) -> Iterator[str]:
     """Warn of each repeat: which landmarks, how far apart, since when, and what to do."""
     for each in found:
         pairs, far = each["landmarks"], float(np.hypot(*each["shift_m"]))

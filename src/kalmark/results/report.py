@@ -35,13 +35,14 @@ from kalmark.results.figure_texts import (
     MORE,
     ROBOT,
     TOTALS,
+    Figures,
     column_header,
     difference_rows,
     rows_with_labels,
 )
 from kalmark.results.filter_description import KEPT
 from kalmark.results.history import WHOLE, Camera, History, Ints, LandmarkChange, MapSnapshot
-from kalmark.results.measures import anees_interval, nees, nis, pose_error
+from kalmark.results.measures import anees_interval, associated_nis, nees, pose_error, sigmas
 from kalmark.results.plot import BEHIND, Projection
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
@@ -50,6 +51,7 @@ from kalmark.results.scene import (
     Sighting,
     break_path,
     colour_of,
+    gaps_in,
     group_steps,
     images,
     join_polylines,
@@ -59,10 +61,12 @@ from kalmark.results.scene import (
     squares,
     steps_of,
     stretches_of,
+    thin,
 )
 from kalmark.results.self_calibration import MOUNT_COLUMNS, mount_rows
 from kalmark.results.verdict_text import overall, verdict_lines
 
+Data = dict[str, Any]  # of the page, as JSON
 NOT_FIGURES = ("robots", "warnings", "advice", "notes", "gaps", "repeats", "verdict")
 BINS = 120
 LANDMARKS = 40_000  # in all the maps of a page together
@@ -130,7 +134,7 @@ def map_hint(scene: Scene) -> str:
     return keys if scene.picture.ellipses == "off" else f"{scene.picture.sigmas:g}-sigma {ellipses}; {keys}"
 
 
-def robot_table(summary: dict[str, Any]) -> str:
+def robot_table(summary: Figures) -> str:
     """Return the table of the figures of each robot."""
     robots = summary["robots"]
     columns = [row for row in _ROBOT if any(row[0] in figures for figures in robots.values())]
@@ -138,7 +142,7 @@ def robot_table(summary: dict[str, Any]) -> str:
     return _table(rows, ("robot", *(column_header(label, unit) for _, label, unit in columns)))
 
 
-def summary_table(summary: dict[str, Any]) -> str:
+def summary_table(summary: Figures) -> str:
     """Return the table of all other figures in words; the tooltip of each is its key in ``summary.json``."""
     figures = dict(_flat(summary))
     words = [*TOTALS, *MORE, *((f"batch.{key}", f"batch solution: {label}", unit) for key, label, unit in BATCH)]
@@ -166,7 +170,7 @@ def figure_text(value: Any, unit: str = "") -> str:
     return str(value)
 
 
-def _flat(summary: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+def _flat(summary: Figures, prefix: str = "") -> list[tuple[str, Any]]:
     out: list[tuple[str, Any]] = []
     for key, value in summary.items():
         if (key in NOT_FIGURES and not prefix) or key in ("directions", "pose_differences"):
@@ -187,7 +191,7 @@ def _section(title: str, rows: list[Any], head: tuple[str, ...]) -> str:
     return f"<h2>{title}</h2>{_table(rows, head)}" if rows else ""
 
 
-def _skipped(run: Recording, summary: dict[str, Any]) -> str:
+def _skipped(run: Recording, summary: Figures) -> str:
     lines = ([f"stopped: {run.stopped}"] if run.stopped else []) + run.skipped
     if not lines:
         return ""
@@ -199,7 +203,7 @@ def _resource(name: str) -> str:
     return (resources.files("kalmark.results") / "page" / name).read_text(encoding="utf-8")
 
 
-def series(run: Recording, scene: Scene) -> dict[str, Any]:
+def series(run: Recording, scene: Scene) -> Data:
     """Return all that the pictures of a report need; times in seconds since the first step."""
     t, pictures = run.history.t_s, Pictures(run)
     dof, maps = (3, 6)[scene.d - 2], run.history.maps
@@ -217,12 +221,12 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
         "knownLandmarks": {"id": [str(i) for i in scene.known_ids], **xy(scene.known)},
         "unseenLandmarks": xy(scene.unseen),
         "trueLines": xy(join_polylines(scene.true_lines(), scene.d)),
-        "fixes": {robot: xy(points[spread_indices(len(points))]) for robot, points in scene.fixes.items()},
+        "fixes": {robot: xy(thin(way.fixes)) for robot, way in scene.ways.items() if len(way.fixes)},
         "repeats": xy(scene.repeats),
-        "usedFixes": {robot: xy(points[spread_indices(len(points))]) for robot, points in scene.used.items()},
-        "bodies": {robot: xy(join_polylines(scene.body(robot))[:, : scene.d]) for robot in scene.paths},
+        "usedFixes": {robot: xy(thin(way.used)) for robot, way in scene.ways.items() if len(way.used)},
+        "bodies": {robot: xy(join_polylines(scene.body(robot))[:, : scene.d]) for robot in scene.ways},
         "cameras": [_camera(run, camera, maps, t, pictures) for camera in run.history.cameras],
-        "robots": [_robot(run, scene, robot, t) for robot in scene.paths],
+        "robots": [_robot(run, scene, robot, t) for robot in scene.ways],
         "innovations": _innovations(run, scene),
         "nis": _nis(run, t),
         "dof": dof,
@@ -232,7 +236,7 @@ def series(run: Recording, scene: Scene) -> dict[str, Any]:
     }
 
 
-def page_options(scene: Scene) -> dict[str, Any]:
+def page_options(scene: Scene) -> Data:
     """Return the options of the pictures of a page; `eye` is the direction to the eye in space."""
     picture = scene.picture
     view = "normal" if picture.view == "self" else picture.view
@@ -250,7 +254,7 @@ def page_options(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _map(m: MapSnapshot, t_s: float, scene: Scene) -> dict[str, Any]:
+def _map(m: MapSnapshot, t_s: float, scene: Scene) -> Data:
     """Return a map: all points, the endpoints of lines last, with the group that each is drawn in."""
     drawn = map_shapes(m, scene.d, scene.world)
     lines = {"lines": xy(join_polylines(drawn.lines, scene.d))}
@@ -272,7 +276,7 @@ def correlation_image(correlations: Array) -> str:
 
 def _camera(
     run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array, pictures: Pictures
-) -> dict[str, Any]:  # fmt: skip
+) -> Data:  # fmt: skip
     """Return the last images of a camera at the maps: `frames` are indices of its `scans`, None before the first."""
     steps, options = steps_of(run.history, camera), picture_of(run)
     last = np.searchsorted(steps, [m.step for m in maps], side="right") - 1
@@ -290,10 +294,10 @@ def _camera(
     return {"name": f"{camera.robot} · {camera.sensor}", "size": size, "scans": scans, "frames": frames}
 
 
-def _seen(s: Sighting, options: Picture) -> dict[str, Any]:
+def _seen(s: Sighting, options: Picture) -> Data:
     colour, meaning = colour_of(s, options)
     colour = to_hex(colour)
-    out: dict[str, Any] = {"name": s.name, "outcome": s.outcome, "y": [round_values(p, 2) for p in s.measured]}
+    out: Data = {"name": s.name, "outcome": s.outcome, "y": [round_values(p, 2) for p in s.measured]}
     if np.isfinite(s.expected).all():
         out |= {"e": [round_values(p, 2) for p in s.expected], "colour": colour, "meaning": meaning}
     if np.isfinite(s.Z).all():
@@ -301,80 +305,62 @@ def _seen(s: Sighting, options: Picture) -> dict[str, Any]:
     return out
 
 
-def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> dict[str, Any]:
-    rows = np.flatnonzero(run.history.robot == robot)
-    rows = rows[spread_indices(len(rows))]
-    mean, P = run.history.poses[rows], scene.pose_covariances[robot][spread_indices(len(scene.paths[robot]))]
-    out: dict[str, Any] = {"name": robot, "colour": scene.colour(robot), "t": round_significant(t[rows], 7)}
-    d = scene.d
-    out |= gaussians(mean[:, :d], P)
-    stretches = scene.stretches[robot][spread_indices(len(scene.stretches[robot]))]
-    out["gaps"] = _gaps(stretches)
-    out["dotted"] = _gaps(np.cumsum(scene.dotted[robot], dtype=np.int64)[spread_indices(len(scene.dotted[robot]))])
+def _robot(run: Recording, scene: Scene, robot: str, t: Array) -> Data:
+    rows, way, d = thin(np.flatnonzero(run.history.robot == robot)), scene.ways[robot], scene.d
+    mean, stretches = run.history.poses[rows], thin(way.stretches)
+    out: Data = {"name": robot, "colour": scene.colour(robot), "t": round_significant(t[rows], 7)}
+    out |= gaussians(mean[:, :d], thin(way.covariances))
+    out["gaps"] = gaps_in(stretches).tolist()
+    out["dotted"] = gaps_in(thin(np.cumsum(way.dotted))).tolist()
     out |= _orientations(mean)
-    dead = scene.dead[robot]
-    if np.isfinite(dead).any():
-        out["dead"] = xy(break_path(dead[spread_indices(len(dead))], stretches))
-    if robot in scene.truth:
-        true = scene.truth[robot][spread_indices(len(scene.truth[robot]))]
-        out["truth"] = xy(true[:, :d]) | _orientations(true)
-        out |= _errors(run, rows)
-    else:
-        out["sigma"] = [round_significant(column) for column in _sigmas(run, rows).T]
-    return out
+    if np.isfinite(way.dead).any():
+        out["dead"] = xy(break_path(thin(way.dead), stretches))
+    if len(way.truth):
+        out["truth"] = xy(thin(way.truth)[:, :d]) | _orientations(thin(way.truth))
+    return out | _errors(run, rows, len(way.truth) > 0)
 
 
-def _orientations(poses: Array) -> dict[str, Any]:
+def _orientations(poses: Array) -> Data:
     """Return the headings of poses (N, 3), or the quaternions of poses (N, 7)."""
     if poses.shape[1] == 3:
         return {"theta": round_significant(poses[:, 2], 5)}
-    return {"q": [round_significant(q, 5) for q in poses[:, 3:].T]}
+    return {"q": round_columns(poses[:, 3:], 5)}
 
 
-def _sigmas(run: Recording, rows: Ints) -> Array:
-    """Return the sigmas of the pose (N, dof), m and degrees."""
-    P, metres = run.history.pose_covariances[rows], 3 if run.history.in_space else 2
-    sigma = np.sqrt(np.maximum(np.einsum("nii->ni", P), 0.0))
-    sigma[:, metres:] *= 180.0 / np.pi
-    return np.asarray(sigma)
-
-
-def _errors(run: Recording, rows: Ints) -> dict[str, Any]:
+def _errors(run: Recording, rows: Ints, scored: bool) -> Data:
     """Return errors (estimate less truth) and sigmas in m and degrees, and the NEES in the estimator's coordinates."""
     mean, P = run.history.poses[rows], run.history.pose_covariances[rows]
-    truth = run.truth.poses_in_map()[rows]
-    metres, turns = (3, 3) if run.history.in_space else (2, 1)
-    scale = np.repeat([1.0, 180.0 / np.pi], [metres, turns])
-    error = -pose_error(mean, truth) * scale
-    return {
-        "error": [round_significant(column) for column in error.T],
-        "sigma": [round_significant(column) for column in _sigmas(run, rows).T],
-        "nees": round_significant(nees(pose_error(mean, truth, run.coordinates), P)),
-    }
+    scale = np.where(np.arange(P.shape[1]) < run.history.d, 1.0, 180.0 / np.pi)
+    out: Data = {"sigma": round_columns(sigmas(P) * scale)}
+    if scored:
+        truth = run.truth.poses_in_map()[rows]
+        out["error"] = round_columns(-pose_error(mean, truth) * scale)
+        out["nees"] = round_significant(nees(pose_error(mean, truth, run.coordinates), P))
+    return out
 
 
-def _nis(run: Recording, t: Array) -> dict[str, Any]:
+def _nis(run: Recording, t: Array) -> Data:
     """Return NIS per degree of freedom over windows of steps, the 95 % bounds of each, and where gaps in time are."""
     history = run.history
-    used = history.outcome == "associated"
-    value, dof = nis(history.z[used], history.Z[used])
-    steps, at = np.unique(history.step[used][dof > 0], return_inverse=True)
+    value, dof, step = associated_nis(history)
+    steps, at = np.unique(step, return_inverse=True)
     window = max(1, -(-len(t) // (POINTS // 4)))
     groups, gaps = group_steps(steps, history.t_ns[steps], window)
-    total = np.bincount(groups[at], value[dof > 0])
-    degrees = np.bincount(groups[at], dof[dof > 0]).astype(int)
+    total = np.bincount(groups[at], value)
+    degrees = np.bincount(groups[at], dof).astype(int)
     bounds = {n: anees_interval(n) for n in np.unique(degrees).tolist()}
+    low, high = np.array([bounds[n] for n in degrees.tolist()]).reshape(-1, 2).T / degrees
     return {
         "t": round_significant(np.bincount(groups, t[steps]) / np.bincount(groups), 7),
         "value": round_significant(total / degrees),
-        "low": round_significant(np.array([bounds[n][0] / n for n in degrees.tolist()])),
-        "high": round_significant(np.array([bounds[n][1] / n for n in degrees.tolist()])),
+        "low": round_significant(low),
+        "high": round_significant(high),
         "gaps": gaps.tolist(),
         "window": window,
     }
 
 
-def _outcomes(run: Recording, t: Array) -> dict[str, Any]:
+def _outcomes(run: Recording, t: Array) -> Data:
     """Return the numbers of observations by outcome in each of some 120 stretches of time."""
     history = run.history
     edges = np.linspace(0.0, max(float(t[-1]), 1e-9) if len(t) else 1.0, BINS + 1)
@@ -386,28 +372,22 @@ def _outcomes(run: Recording, t: Array) -> dict[str, Any]:
     }
 
 
-def _innovations(run: Recording, scene: Scene) -> list[dict[str, Any]]:
+def _innovations(run: Recording, scene: Scene) -> list[Data]:
     """Return each robot's innovations of fixes and their sigmas in m, thinned, and by themselves those rejected."""
     begin_ns, out = int(run.history.t_ns[:1].sum()), []
-    for robot in scene.paths:
+    for robot in scene.ways:
         fixes = [fix for fix in run.history.fixes if fix.robot == robot]
         if not fixes:
             continue
-        t_ns, used = np.array([fix.t_ns for fix in fixes]), np.array([fix.used for fix in fixes])
-        t, z = (t_ns - begin_ns) * 1e-9, np.array([fix.z for fix in fixes])
-        sigma = np.sqrt(np.maximum([np.diagonal(fix.Z) for fix in fixes], 0.0))
-        rows, bad = spread_indices(len(fixes)), np.flatnonzero(~used)
-        bad = bad[spread_indices(len(bad))]
-        curves = {key: [round_significant(c) for c in x[rows].T] for key, x in (("z", z), ("sigma", sigma))}
-        rejected = {"t": round_significant(t[bad], 7), "z": [round_significant(column) for column in z[bad].T]}
+        t_ns, z = np.array([fix.t_ns for fix in fixes]), np.array([fix.z for fix in fixes])
+        t, rows = (t_ns - begin_ns) * 1e-9, spread_indices(len(fixes))
+        bad = thin(np.flatnonzero([not fix.used for fix in fixes]))
+        sigma = sigmas(np.array([fix.Z for fix in fixes]))
+        curves = {"z": round_columns(z[rows]), "sigma": round_columns(sigma[rows])}
+        rejected = {"t": round_significant(t[bad], 7), "z": round_columns(z[bad])}
         head = {"name": robot, "colour": scene.colour(robot), "t": round_significant(t[rows], 7)}
-        out.append({**head, **curves, "gaps": _gaps(stretches_of(t_ns)[rows]), "rejected": rejected})
+        out.append({**head, **curves, "gaps": gaps_in(stretches_of(t_ns)[rows]).tolist(), "rejected": rejected})
     return out
-
-
-def _gaps(stretches: Ints) -> list[int]:
-    """Return before which of the points with these numbers of gaps there is one."""
-    return (np.flatnonzero(np.diff(stretches)) + 1).tolist()
 
 
 def common_reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]:
@@ -422,7 +402,7 @@ def common_reasons(run: Recording, most: int = 15) -> list[tuple[str, str, int]]
     return [(outcome, reason, count) for (outcome, reason), count in counts.most_common(most)]
 
 
-def _association(run: Recording, t: Array, world: bool) -> dict[str, Any]:
+def _association(run: Recording, t: Array, world: bool) -> Data:
     """Return ambiguous scans in the order of time, and when landmarks were merged or removed."""
     changes = _told_changes(run.history)
     return {
@@ -461,14 +441,14 @@ def change_rows(run: Recording) -> Iterator[tuple[str, str, str, str]]:
         yield "", "", "", f"and {len(told) - CHANGES} more: see associations.csv"
 
 
-def _ambiguous(history: History, told: Explanation, world: bool) -> dict[str, Any]:
+def _ambiguous(history: History, told: Explanation, world: bool) -> Data:
     here, P = told.pose[None, :2], told.covariance[None, :2, :2]
     pose = gaussians(here, P if world else history.robot_shape(np.array([told.step]))[:, :2, :2])
     out = {"t": round(told.t_s, 3), "in_log": told.in_log, "robot": told.robot, "sensor": told.sensor, "pose": pose}
     return out | {"seen": [_fate(fate) for fate in told.fates]}
 
 
-def _fate(fate: Fate) -> dict[str, Any]:
+def _fate(fate: Fate) -> Data:
     x, y = round_values(fate.seen_at[:2], 4)
     near = [
         {"name": str(c.landmark), "d2": float(f"{c.d2:.3g}")}
@@ -481,12 +461,12 @@ def _fate(fate: Fate) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def xy(points: Array) -> dict[str, Any]:
+def xy(points: Array) -> Data:
     """Return points (N, 2 or 3) to a tenth of a millimetre."""
     return {axis: round_values(column, 4) for axis, column in zip("xyz", points.T, strict=False)}
 
 
-def gaussians(means: Array, covariances: Array) -> dict[str, Any]:
+def gaussians(means: Array, covariances: Array) -> Data:
     """Return means (N, d) and covariances (N, d, d) column by column: x, y, pxx, pxy, pyy, in space more."""
     pairs = combinations_with_replacement(range(means.shape[1]), 2)
     return xy(means) | {f"p{'xyz'[i]}{'xyz'[j]}": round_significant(covariances[:, i, j]) for i, j in pairs}
@@ -495,6 +475,11 @@ def gaussians(means: Array, covariances: Array) -> dict[str, Any]:
 def round_values(values: Array, digits: int) -> list[float | None]:
     """Return values to so many decimals, None for NaN and infinity."""
     return [value if math.isfinite(value) else None for value in np.round(values, digits).tolist()]
+
+
+def round_columns(values: Array, digits: int = 4) -> list[list[float | None]]:
+    """Return the columns of values (N, n) to so many significant digits."""
+    return [round_significant(column, digits) for column in values.T]
 
 
 def round_significant(values: Array, digits: int = 4) -> list[float | None]:

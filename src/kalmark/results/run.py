@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from kalmark.files import replace_folder, write
 from kalmark.results.evaluate import evaluate
+from kalmark.results.figure_texts import Figures
 from kalmark.results.history import Camera, Measuring
 from kalmark.results.recording import Recording, file_name
 from kalmark.results.scene import picture_of, steps_of
@@ -37,7 +37,7 @@ class Run(Recording):
     <Run '' of 'rover': 4 steps, 0 observations, 0 landmarks>
     """
 
-    def evaluate(self, batch: bool = False) -> dict[str, Any]:
+    def evaluate(self, batch: bool = False) -> Figures:
         """Return the figures of ``summary.json``; with `batch` also the comparison with the batch solution."""
         summary = evaluate(self)
         if batch:

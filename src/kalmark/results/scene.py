@@ -13,13 +13,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.events import Id
+from kalmark.geometry.gaussian import contours, is_finite
 from kalmark.geometry.rotations import matrix
 from kalmark.picture_options import USUAL, Picture
 from kalmark.report import Report
@@ -27,10 +27,11 @@ from kalmark.results.control_gaps import while_lost
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
 from kalmark.results.history import Camera, History, Ints, MapSnapshot, Measuring
 from kalmark.results.landmark_table import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
-from kalmark.results.measures import rigid
+from kalmark.results.measures import Rigid, rigid, sigmas
 from kalmark.results.recording import Recording
 from kalmark.results.truth import as_rigid, move_landmarks
 
+Style = dict[str, Any]  # keywords of matplotlib
 COLUMN = re.compile(r"([uv])([lr]?)(\d*)_px")
 EXPECTED = {  # names of colours, usual ones, meanings: by whether a landmark is Euclidean, then whether it was used
     (True, True): ("landmarks_used", "#0aa5b5", "Euclidean, used"),
@@ -78,15 +79,29 @@ class Ray(NamedTuple):
     landmark: Array
 
 
+class Way(NamedTuple):
+    """A robot's way up to a step: poses (N, 3|7) and the covariances (N, d, d) of their positions.
+
+    `stretches` (S,) are the gaps in time up to each of all its steps, `dotted` (S,) flags those to which the way is
+    unknown.  `dead` (N, d) are positions by dead reckoning, `truth` (N or 0, 3|7; NaN: unknown) true poses, `fixes`
+    (F, 2) those to score with and `used` (F, d) those that the filter used.
+    """
+
+    path: Array
+    covariances: Array
+    stretches: Ints
+    dotted: Flags
+    dead: Array
+    truth: Array
+    fixes: Array
+    used: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A run up to one of its steps, or a filter now, in the plane (d = 2) or in space (d = 3).
 
-    By robot: poses (N, 3|7) and the covariances (N, d, d) of their positions up to the step, `stretches` (S,), the gaps
-    in time up to each of all its steps, `dotted` (S,), whether the way to each is unknown, positions by `dead`
-    reckoning (N, d), true poses (N, 3|7; NaN: unknown), fixes (F, 2) to score with and those `used` by the filter
-    (F, d), up to the step, too.
-    `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
+    `ways` are those of the robots.  `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
     `known` (N, d) are the landmarks known exactly and `known_ids` their names.
     `unseen` (N, d) are those that were not seen again where they should be.
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
@@ -97,14 +112,7 @@ class Scene:
     """
 
     d: int
-    paths: dict[str, Array]
-    pose_covariances: dict[str, Array]
-    stretches: dict[str, Ints]
-    dotted: dict[str, Flags]
-    dead: dict[str, Array]
-    truth: dict[str, Array]
-    fixes: dict[str, Array]
-    used: dict[str, Array]
+    ways: dict[str, Way]
     true_landmarks: dict[Id, Array]
     ids: tuple[Id, ...]
     shapes: Shapes
@@ -132,14 +140,10 @@ class Scene:
         if aligned:
             some = np.flatnonzero(known)[spread_indices(int(known.sum()))]
             to_map = rigid(_corners(run.truth.poses[some]), _corners(history.poses[some]))
-        mine = {robot: history.robot == robot for robot in history.robots}
-        truth = {r: run.truth.poses[rows] for r, rows in mine.items() if np.isfinite(run.truth.poses[rows]).any()}
-        scored = [r for r in mine if r in run.truth.fixes and r not in truth] if d == 2 else []
-        truth = {robot: to_map.poses(poses) for robot, poses in truth.items()}
         landmarks = {
             i: l if d == 3 or len(l) == 2 * d else l[:2] for i, l in move_landmarks(to_map, run.truth.landmarks).items()
         }
-        used, (last, exact) = _used_fixes(run, d), run.landmarks.split()
+        last, exact = run.landmarks.split()
         end = history.map_at(len(history.t_ns))
         as_kept = not world and end.ids == tuple(last.ids)
         whole = map_shapes(end, d, world) if as_kept else shapes(*last.places(), last.kinds, d)
@@ -147,38 +151,20 @@ class Scene:
         if step is not None:
             kept = history.map_at(step)
             now, ids = map_shapes(kept, d, world), kept.ids
-        until = slice(None) if step is None else slice(step + 1)
-        poses, P = history.poses, history.pose_covariances[:, :d, :d]
-        P = P if world else history.robot_shape(np.arange(len(P)))
-        ends = {robot: (poses[rows][-1], P[rows][-1]) for robot, rows in mine.items() if rows.any()}
+        P = history.pose_covariances[:, :d, :d] if world else history.robot_shape(np.arange(len(history.t_ns)))
+        final = [np.flatnonzero(history.robot == robot)[-1:] for robot in history.robots]
+        ends = np.concatenate([np.zeros(0, dtype=np.int64), *final])
         known_at = exact.positions()[0][:, :d]
-        more = [*(way[:, :d] for way in truth.values()), *used.values(), *places_of(landmarks, d), known_at]
-        low, high = drawn_box(poses[:, :d], ends, whole, more, picture)
-        paths, covariances = ({r: x[until][rows[until]] for r, rows in mine.items()} for x in (poses, P))
-        dead = {r: history.dead_reckoned[until][rows[until]][:, :d] for r, rows in mine.items()}
-        stretches = {robot: stretches_of(history.t_ns[rows]) for robot, rows in mine.items()}
-        lost = while_lost(history)
-        dotted = {
-            r: lost[rows] | np.append(False, lost[rows])[:-1] | (np.diff(stretches[r], prepend=0) > 0)
-            for r, rows in mine.items()
-        }
-        fixes = {}
-        for robot in scored:  # the antenna's offset is taken off
-            to_fixes, _, offset, xy, t_ns = aligned_fixes(run, robot)
-            fixes[robot] = to_fixes.inverse()(xy) - offset if len(xy) > 1 else np.empty((0, 2))
-            if step is not None:
-                fixes[robot] = fixes[robot][t_ns[: len(fixes[robot])] <= history.t_ns[step]]
-        if step is not None:  # no more than is known at that time
-            truth = {robot: points[: len(paths[robot])] for robot, points in truth.items()}
-            used = _used_fixes(run, d, int(history.t_ns[step]))
-        cameras = history.cameras
+        fixes = [used_fixes(run, robot) for robot in history.robots]
+        more = [to_map.poses(run.truth.poses)[:, :d], *fixes, *places_of(landmarks, d), known_at]
+        low, high = drawn_box(history.poses[:, :d], history.poses[ends, :d], P[ends], whole, more, picture)
         at = {str(name): now.means[k] for k, name in enumerate(ids)}
         twice = [np.array([at[row.landmark], at[row.other]]) for row in history.repeats if {*row[1:3]} <= at.keys()]
         unseen = np.array([at[str(i)][:d] for i in last.ids if i in last.unseen and str(i) in at]).reshape(-1, d)
         return cls(
-            d, paths, covariances, stretches, dotted, dead, truth, fixes, used, landmarks, ids, now, cameras, low, high,
-            join_polylines([line[:, :d] for line in twice], d), unseen, known_at, tuple(exact.ids),
-            world, aligned, picture=picture,
+            d, {robot: way_of(run, robot, P, to_map, step) for robot in history.robots}, landmarks, ids, now,
+            history.cameras, low, high, join_polylines([line[:, :d] for line in twice], d), unseen, known_at,
+            tuple(exact.ids), world, aligned, picture=picture,
         )  # fmt: skip
 
     @property
@@ -214,16 +200,16 @@ class Scene:
     def colour(self, robot: str) -> str:
         """Return the robot's colour."""
         colours = SPACE_COLOURS if self.d == 3 else COLOURS
-        return self.picture.colour(robot, colours[list(self.paths).index(robot) % len(colours)])
+        return self.picture.colour(robot, colours[list(self.ways).index(robot) % len(colours)])
 
     def line(self, robot: str) -> Array:
         """Return a robot's path (N, d), NaN where its way is unknown."""
-        return break_path(self.paths[robot][:, : self.d], np.cumsum(self.dotted[robot]))
+        return break_path(self.ways[robot].path[:, : self.d], np.cumsum(self.ways[robot].dotted))
 
     def bridges(self, robot: str) -> Array:
         """Return the rest of a robot's path (N, d): across gaps of time and while it is lost, NaN between them."""
-        path = self.paths[robot][:, : self.d]
-        ends = np.diff(self.dotted[robot][: len(path)].astype(int), prepend=0, append=0)
+        path = self.ways[robot].path[:, : self.d]
+        ends = np.diff(self.ways[robot].dotted[: len(path)].astype(int), prepend=0, append=0)
         spans = zip(np.flatnonzero(ends > 0).tolist(), np.flatnonzero(ends < 0).tolist(), strict=True)
         return join_polylines([path[max(first - 1, 0) : last] for first, last in spans], self.d)
 
@@ -234,7 +220,7 @@ class Scene:
 
     def frames(self, robot: str) -> list[Array]:
         """Return the shapes of a robot in space along its path."""
-        path, body = self.paths[robot], self.body(robot)
+        path, body = self.ways[robot].path, self.body(robot)
         at = np.unique(np.linspace(0, max(len(path) - 1, 0), FRAMES).round().astype(int))
         return [_placed(pose, line) for pose in path[at[: len(path)]] for line in body]
 
@@ -252,7 +238,7 @@ class Scene:
     @property
     def true_ends(self) -> dict[str, Array]:
         """The true poses (3|7,) of robots at the step, where they are known."""
-        return {robot: way[-1] for robot, way in self.truth.items() if np.isfinite(way[-1:]).all(axis=1).any()}
+        return {robot: w.truth[-1] for robot, w in self.ways.items() if np.isfinite(w.truth[-1:]).all(axis=1).any()}
 
     def true_lines(self) -> list[Array]:
         """Return the true lines (2, d)."""
@@ -273,27 +259,6 @@ def squares(tags: Array, size: float) -> list[Array]:
     return [_placed(tag, 0.03 * size * SQUARE) for tag in tags]
 
 
-def contours(means: Array, covariances: Array, sigmas: float = 3.0) -> Array:
-    """Return the contours (K, C, N, d) of many Gaussians at once, closed: ellipses, in space three great circles each.
-
-    [S] (85)-(87).  NaN where a Gaussian is not finite.
-    """
-    d = means.shape[1]
-    alpha = np.linspace(0.0, 2.0 * np.pi, 41 if d == 2 else 25)
-    circles = np.zeros((d * (d - 1) // 2, d, len(alpha)))
-    for circle, (i, j) in zip(circles, combinations(range(d), 2), strict=True):
-        circle[i], circle[j] = np.cos(alpha), np.sin(alpha)
-    known = _known(means, covariances)
-    values, axes = np.linalg.eigh(np.where(known[:, None, None], covariances, 0.0))
-    half = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    out = means[:, None, None, :] + sigmas * np.einsum("kij,cjp->kcpi", half, circles)
-    return np.where(known[:, None, None, None], out, np.nan)
-
-
-def _known(means: Array, covariances: Array) -> Flags:
-    return np.logical_and(np.isfinite(covariances).all(axis=(1, 2)), np.isfinite(means).all(axis=1))
-
-
 def join_polylines(lines: Sequence[Array] | Array, d: int = 3) -> Array:
     """Return polylines (P, d) as one (N, d) that is broken by NaN between them."""
     parts = [part for line in lines for part in (line, np.full((1, d), np.nan))]
@@ -310,8 +275,12 @@ def stretches_of(t_ns: Ints) -> Ints:
 
 def break_path(points: Array, stretches: Ints) -> Array:
     """Return a path (N, d) with a row of NaN before each new stretch, so that no line is drawn across the gap."""
-    at = np.flatnonzero(np.diff(stretches[: len(points)])) + 1
-    return np.insert(points, at, np.nan, axis=0)
+    return np.insert(points, gaps_in(stretches[: len(points)]), np.nan, axis=0)
+
+
+def gaps_in(stretches: Ints) -> Ints:
+    """Return before which of the points with these numbers of gaps there is one."""
+    return np.flatnonzero(np.diff(stretches)) + 1
 
 
 def spread_indices(count: int) -> Ints:
@@ -321,6 +290,11 @@ def spread_indices(count: int) -> Ints:
     return np.append(indices, count - 1) if count and indices[-1] != count - 1 else indices
 
 
+def thin(rows: Any) -> Any:
+    """Return at most about 2,000 evenly spread rows (N, ...), the last one among them."""
+    return rows[spread_indices(len(rows))]
+
+
 def group_steps(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
     """Return the group (N,) of each of these steps, and before which groups a gap in time is.
 
@@ -328,14 +302,38 @@ def group_steps(steps: Ints, t_ns: Ints, each: int) -> tuple[Ints, Ints]:
     """
     stretches = stretches_of(t_ns)
     new = (np.diff(steps // each, prepend=-1) != 0) | (np.diff(stretches, prepend=0) != 0)
-    return np.cumsum(new) - 1, np.flatnonzero(np.diff(stretches[new])) + 1
+    return np.cumsum(new) - 1, gaps_in(stretches[new])
 
 
-def _used_fixes(run: Recording, d: int, until_ns: float = np.inf) -> dict[str, Array]:
-    """Return the fixes (N, d) of each robot that the filter used until then; they are in the frame of the map."""
-    used = [fix for fix in run.history.fixes if fix.used and fix.t_ns <= until_ns]
-    rows = {name: np.array([fix.y for fix in used if fix.robot == name]) for name in sorted({f.robot for f in used})}
-    return {name: np.pad(y, ((0, 0), (0, d - y.shape[1]))) for name, y in rows.items()}
+def way_of(run: Recording, robot: str, P: Array, to_map: Rigid, step: int | None = None) -> Way:
+    """Return a robot's way up to a step, by default the last; P (S, d, d) are the covariances of all steps."""
+    history, d = run.history, run.history.d
+    rows = np.flatnonzero(history.robot == robot)
+    until_ns = np.inf if step is None else int(history.t_ns[step])
+    now = rows if step is None else rows[rows <= step]
+    stretches, lost = stretches_of(history.t_ns[rows]), while_lost(history)[rows]
+    dotted = lost | np.append(False, lost)[:-1] | (np.diff(stretches, prepend=0) > 0)
+    truth, fixes = run.truth.poses[rows], np.empty((0, 2))
+    scored = bool(np.isfinite(truth).any())
+    if not scored and d == 2 and robot in run.truth.fixes:  # the antenna's offset is taken off
+        to_fixes, _, offset, xy, t_ns = aligned_fixes(run, robot)
+        fixes = (to_fixes.inverse()(xy) - offset)[t_ns <= until_ns] if len(xy) > 1 else fixes
+    return Way(
+        path=history.poses[now],
+        covariances=P[now],
+        stretches=stretches,
+        dotted=dotted,
+        dead=history.dead_reckoned[now, :d],
+        truth=to_map.poses(truth[: len(now) if scored else 0]),
+        fixes=fixes,
+        used=used_fixes(run, robot, until_ns),
+    )
+
+
+def used_fixes(run: Recording, robot: str, until_ns: float = np.inf) -> Array:
+    """Return the fixes (N, d) of a robot that the filter used until then; they are in the frame of the map."""
+    used = [fix.y for fix in run.history.fixes if fix.used and fix.robot == robot and fix.t_ns <= until_ns]
+    return np.array([np.pad(y, (0, run.history.d - len(y))) for y in used]).reshape(-1, run.history.d)
 
 
 def _corners(poses: Array) -> Array:
@@ -361,34 +359,34 @@ def picture_of(run: Recording) -> Picture:
 
 
 def drawn_box(
-    path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array], picture: Picture
+    path: Array, ends: Array, P: Array, drawn: Shapes, more: list[Array], picture: Picture
 ) -> tuple[Array, Array]:
     """Return the corners (d,) of what is to be seen: a path, contours at its ends, landmarks whose place is clear.
 
-    Contours reach out of it where they are huge.  Limits of the picture replace what they name.
+    The ends (R, d) have the covariances P (R, d, d).  Contours reach out of it where they are huge.  Limits of the
+    picture replace what they name.
     """
-    low, high = _box(path, ends, drawn, more)
+    low, high = _box(path, ends, P, drawn, more)
     given = np.reshape(picture.limits_m or (), (-1, 2))[: len(low)]
     low[: len(given)], high[: len(given)] = given.T
     return low, high
 
 
-def _box(path: Array, ends: Mapping[str, tuple[Array, Array]], drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:
+def _box(path: Array, ends: Array, P: Array, drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:
     d = path.shape[1]
     means, covariances = drawn.means, drawn.covariances
-    known = _known(means, covariances)
-    sigma = np.sqrt(np.maximum(np.einsum("kii->ki", np.where(known[:, None, None], covariances, 0.0)), 0.0))
+    known = is_finite(means, covariances)
+    sigma = sigmas(np.where(known[:, None, None], covariances, 0.0))
     middle = path.mean(axis=0) if len(path) else np.zeros(d)
     distance = np.linalg.norm(np.where(known[:, None], means, np.inf) - middle, axis=1)
     clear = known & ((drawn.group == EUCLIDEANS) | (sigma.max(axis=1, initial=0.0) < CLEAR * distance))
-    last = np.array([pose[:d] for pose, _ in ends.values()]).reshape(-1, d)
-    spread = np.array([np.sqrt(np.maximum(np.diagonal(P)[:d], 0.0)) for _, P in ends.values()]).reshape(-1, d)
     points = np.concatenate([path, means[clear], *more])
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         return -np.ones(d), np.ones(d)
     limit = max(REACH * float(np.ptp(points, axis=0).max()), REACH_M)
-    centres, reach = np.concatenate([means[clear], last]), np.fmin(3 * np.concatenate([sigma[clear], spread]), limit)
+    centres = np.concatenate([means[clear], ends])
+    reach = np.fmin(3 * np.concatenate([sigma[clear], sigmas(P)]), limit)
     points = np.concatenate([points, centres - reach, centres + reach])
     low, high = points.min(axis=0), points.max(axis=0)
     middle, half = (low + high) / 2, (high - low) / 2

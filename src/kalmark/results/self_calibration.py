@@ -8,7 +8,7 @@ to a direction that nothing told of.  C^-1/2 is the symmetric root: directions s
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +16,10 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import unit_of
 from kalmark.geometry.named_poses import describe_pose
-from kalmark.results.figure_texts import figure
+from kalmark.results.figure_texts import Figures, Summary, figure
 from kalmark.results.history import Biased, CalibratedMount
+from kalmark.results.measures import sigmas
+from kalmark.results.recording import Section
 
 AXES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m"} | dict.fromkeys(("theta", "roll", "pitch", "yaw"), "deg")
@@ -77,10 +79,10 @@ def directions(prior: Array, posterior: Array, constants: Sequence[str] = ()) ->
     return found
 
 
-def mount_figures(mount: CalibratedMount) -> dict[str, Any]:
+def mount_figures(mount: CalibratedMount) -> Figures:
     """Return the estimated mount of a self-calibrating sensor, its sigmas, and the directions observed."""
     d, pose, dof = (3, 7, 6) if len(mount.mean) - len(mount.constants) == 7 else (2, 3, 3)
-    sigma = np.sqrt(np.maximum(np.diagonal(mount.covariance), 0.0))
+    sigma = sigmas(mount.covariance)
     axes = describe_pose(mount.mean[:pose])
     own = {f"sigma_{key}": each for key, each in zip(axes, sigma[:d].tolist(), strict=False)}
     found = [
@@ -97,14 +99,13 @@ def mount_figures(mount: CalibratedMount) -> dict[str, Any]:
     }
 
 
-def bias_figures(bias: Biased, motion: Mapping[str, Any]) -> dict[str, float]:
+def bias_figures(bias: Biased, motion: Section) -> dict[str, float]:
     """Return the estimated correction to be added to a robot's controls, and its sigmas.
 
     Of a parameter of its `motion`, a radius or a track, it is the parameter itself: the configured one, corrected.
     """
-    sigmas = np.sqrt(np.maximum(np.diagonal(bias.covariance), 0.0)).tolist()
     found = {name: motion.get(name, 0.0) + off for name, off in zip(bias.columns, bias.mean.tolist(), strict=True)}
-    return found | {f"sigma_{column}": sigma for column, sigma in zip(bias.columns, sigmas, strict=True)}
+    return found | {f"sigma_{name}": own for name, own in zip(found, sigmas(bias.covariance).tolist(), strict=True)}
 
 
 def _constant_figures(names: Sequence[str], values: Array, P: Array) -> dict[str, float]:
@@ -114,23 +115,22 @@ def _constant_figures(names: Sequence[str], values: Array, P: Array) -> dict[str
         gain, offset = found.pop("gain"), found.pop("offset", None)
         J = np.array([[-1.0 / gain, 0.0], [-(offset or 0.0) / gain, 1.0]])[: len(names), : len(names)] / gain
         found = {"scale": 1.0 / gain} | ({} if offset is None else {"bias_m": offset / gain})
-    sigmas = np.sqrt(np.maximum(np.diagonal(J @ P @ J.T), 0.0)).tolist()
-    return found | {f"sigma_{name}": sigma for name, sigma in zip(found, sigmas, strict=True)}
+    return found | {f"sigma_{name}": own for name, own in zip(found, sigmas(J @ P @ J.T).tolist(), strict=True)}
 
 
-def _found(summary: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str, str]]:
+def _found(summary: Summary) -> Iterator[tuple[str, Figures, str, str]]:
     """Yield every direction of every mount in a summary, and its sigmas before and after as people read them."""
     for name, figures in summary.get("mounts", {}).items():
         for row in figures.get("directions", ()):
             yield name, row, _sigma(row["prior_sigma"], row["unit"]), _sigma(row["sigma"], row["unit"])
 
 
-def mount_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def mount_rows(summary: Summary) -> list[tuple[str, ...]]:
     """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
     return [(name, row["direction"], *sigmas, f"{row['ratio']:.3f}") for name, row, *sigmas in _found(summary)]
 
 
-def estimate_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def estimate_rows(summary: Summary) -> list[tuple[str, ...]]:
     """Return a row of text for every constant of a mount, a range or a control that was estimated."""
     rows: list[tuple[str, ...]] = []
     for name, figures in {**summary.get("mounts", {}), **summary.get("biases", {})}.items():
@@ -143,7 +143,7 @@ def estimate_rows(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return rows
 
 
-def mount_warnings(_: Any, summary: Mapping[str, Any]) -> Iterator[str]:
+def mount_warnings(_: Any, summary: Summary) -> Iterator[str]:
     """Return a line for every direction of a mount that was not observed."""
     for name, row, before, after in _found(summary):
         if row["ratio"] > UNOBSERVED:

@@ -15,7 +15,7 @@ from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.logs.log import Log, PositionTrack, poses_of_size
 from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, padded_all, texts
 from kalmark.results.landmark_table import TAG
-from kalmark.results.measures import Rigid, pose_error
+from kalmark.results.measures import Rigid, pose_error, sigmas
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 SAME_FRAME_M, SAME_FRAME_RAD, SAME_FRAME_SIGMAS = 0.05, 0.02, 4.0
@@ -154,7 +154,7 @@ def frame_offset(trajectories: Mapping[str, Any], starts: Sequence[RobotStart], 
             continue
         n = 2 if size == 3 else 3
         d = pose_error(start.mean[:size], true)
-        sigma = np.sqrt(np.maximum(np.diagonal(start.covariance)[: len(d)], 0.0))
+        sigma = sigmas(start.covariance)[: len(d)]
         slack = np.repeat([SAME_FRAME_M, SAME_FRAME_RAD], [n, len(d) - n])
         if (np.abs(d) <= SAME_FRAME_SIGMAS * sigma + slack).all():
             break

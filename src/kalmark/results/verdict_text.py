@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 from kalmark.results.checked import OK, UNCHECKED, worst_status
-from kalmark.results.figure_texts import count, figure
+from kalmark.results.figure_texts import Summary, count, figure
 
 SHOWN = 3  # causes in a short verdict
 ROUNDING_M = 1e-9
@@ -17,7 +16,7 @@ NO_LANDMARKS = "no sensor observes landmarks"  # why there is no map, either
 SEEN = 0.02  # by which a factor of the sigmas is worth a word, and of the accuracy a shift
 
 
-def verdict_lines(verdict: Mapping[str, Any], shown: int | None = SHOWN) -> Iterator[str]:
+def verdict_lines(verdict: Summary, shown: int | None = SHOWN) -> Iterator[str]:
     """Yield a verdict of ``summary.json`` in words: the map, then so many causes (None: all), each with its cure."""
     causes = verdict["causes"]
     yield _first(verdict)
@@ -28,19 +27,19 @@ def verdict_lines(verdict: Mapping[str, Any], shown: int | None = SHOWN) -> Iter
         yield f"{count(len(causes) - len(some), 'more cause')}: kalmark diagnose"
 
 
-def alarm(verdict: Mapping[str, Any] | None) -> list[str]:
+def alarm(verdict: Summary | None) -> list[str]:
     """Return the lines for the picture of a map or a path that is not ok: the first cause."""
     if verdict is None or overall(verdict) == OK:
         return []
     return [_first(verdict), *(cause["evidence"] for cause in verdict["causes"][:1])]
 
 
-def overall(verdict: Mapping[str, Any]) -> str:
+def overall(verdict: Summary) -> str:
     """Return the worst status of a map and of the paths of its robots."""
     return worst_status(verdict["map"], *verdict.get("robots", {}).values())
 
 
-def _first(verdict: Mapping[str, Any]) -> str:
+def _first(verdict: Summary) -> str:
     """Return the summary line: the status of the map, or the path, its cause, and its accuracy."""
     harmful = next((f" because of {cause['name']}" for cause in verdict["causes"] if not cause["harmless"]), "")
     why = ": the log does not check it" if verdict["map"] == UNCHECKED else harmful * (verdict["map"] != OK)
@@ -50,13 +49,13 @@ def _first(verdict: Mapping[str, Any]) -> str:
     return "; but ".join([f"the {what} is {verdict['map']}{why}{_trust(verdict)}", *[", ".join(paths)] * bool(paths)])
 
 
-def _worse(verdict: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def _worse(verdict: Summary) -> Iterator[tuple[str, str]]:
     """Yield the robots whose path is worse than the map, and what it is."""
     robots = verdict.get("robots", {})
     return ((of, status) for of, status in robots.items() if status != verdict["map"])
 
 
-def _trust(verdict: Mapping[str, Any]) -> str:
+def _trust(verdict: Summary) -> str:
     """Return the accuracy of a map, as text."""
     factor, accuracy, shift = (verdict[key] for key in ("sigma_factor", "accuracy_m", "shift_m"))
     if verdict["map"] != "ok":

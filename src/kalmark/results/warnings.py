@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -31,10 +31,10 @@ from kalmark.models import sensors
 from kalmark.results.association_errors import LEAST, no_ids
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
 from kalmark.results.control_gaps import gap_warnings
-from kalmark.results.figure_texts import count, figure
+from kalmark.results.figure_texts import Figures, Summary, count, figure
 from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix
-from kalmark.results.measures import nis, truncated_variance
-from kalmark.results.recording import Recording
+from kalmark.results.measures import nis, place_sigma, truncated_variance
+from kalmark.results.recording import Recording, Section
 from kalmark.results.repeated_landmarks import repeat_warnings
 from kalmark.results.restarts import restarts
 from kalmark.results.self_calibration import mount_warnings
@@ -83,9 +83,9 @@ class Window:
     chance: float = 0.0
 
 
-def window_figures(history: History) -> dict[str, Any]:
+def window_figures(history: History) -> Figures:
     """Return the figures of ``summary.json`` that windows of time have; absent where there is too little."""
-    out: dict[str, Any] = {}
+    out: Figures = {}
     for name, windows in (("nis", nis_windows(history)), ("left_out", left_out_windows(history))):
         if len(windows) > 1:
             worst = max(windows, key=lambda w: w.value)
@@ -209,12 +209,12 @@ def _left_out(worst: Window, median: float, count: int) -> str:
     return f"{worst.value:.0%} of the observations fit nothing, median {median:.0%},"
 
 
-def warnings(run: Recording, summary: Mapping[str, Any]) -> list[str]:
+def warnings(run: Recording, summary: Summary) -> list[str]:
     """Return a line for everything in a run and its summary that should not be overlooked, the worst first."""
     return [sign.line for sign in signs(run, summary)]
 
 
-def signs(run: Recording, summary: Mapping[str, Any]) -> list[Sign]:
+def signs(run: Recording, summary: Summary) -> list[Sign]:
     """Return the warnings of a run, each with the best status that a verdict can have beside it.
 
     Those about truth leave any, and so do those whose effect a verdict itself states: about noise, starts that
@@ -240,7 +240,7 @@ def signs(run: Recording, summary: Mapping[str, Any]) -> list[Sign]:
     return [Sign(line, status) for lines, status in found for line in lines]
 
 
-def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
+def advice(run: Recording, summary: Summary) -> list[str]:
     """Return a line for each sensor, and for fixes, whose noise is stated far too large.
 
     One if the NIS is tiny for another reason.
@@ -251,38 +251,35 @@ def advice(run: Recording, summary: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _stopped(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
+def _stopped(run: Recording, _: Summary) -> Iterator[str]:
     if run.stopped:
         yield f"the filter stopped: {run.stopped}"
 
 
-def _lost(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
-    again = restarts(run.history)
-    for fix in (fix for fix in run.history.fixes if fix.moved_m > 0):
-        if fix.robot not in again or again[fix.robot].t_ns != fix.t_ns:
-            yield _moved_by(run, fix, "it was")
+def _lost(run: Recording, _: Summary) -> Iterator[str]:
+    yield from _moved(run, "it was", with_map=False)
 
 
-def _moved_by(run: Recording, fix: UsedFix, what: str) -> str:
-    when = f"{(fix.t_ns - _begin_ns(run)) * 1e-9:.1f} s after the first scan"
-    return f"{fix.robot} was lost {when}: its fixes agreed that it was {fix.moved_m:.1f} m away; {what} moved there"
+def _moved(run: Recording, what: str, with_map: bool) -> Iterator[str]:
+    """Yield a line of each time when fixes moved a robot, with all of the map or alone."""
+    again = {(robot, restart.t_ns) for robot, restart in restarts(run.history).items()}
+    for fix in run.history.fixes:
+        if fix.moved_m > 0 and ((fix.robot, fix.t_ns) in again) == with_map:
+            agreed = f"its fixes agreed that it was {fix.moved_m:.1f} m away; {what} moved there"
+            yield f"{fix.robot} was lost {_since_first(run, fix.t_ns)}: {agreed}"
 
 
-def _begin_ns(run: Recording) -> int:
-    return int(run.history.t_ns[0]) if len(run.history.t_ns) else 0
+def _since_first(run: Recording, t_ns: int) -> str:
+    return f"{(t_ns - int(run.history.t_ns[:1].sum())) * 1e-9:.1f} s after the first scan"
 
 
-def _placed(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
-    again = restarts(run.history)
-    for fix in (fix for fix in run.history.fixes if fix.moved_m > 0):
-        if fix.robot in again and again[fix.robot].t_ns == fix.t_ns:
-            yield _moved_by(run, fix, "with all of the map it was")
+def _placed(run: Recording, _: Summary) -> Iterator[str]:
+    yield from _moved(run, "with all of the map it was", with_map=True)
     for mine in placements(run.history):
-        when = f"first {(mine[0].t_ns - _begin_ns(run)) * 1e-9:.1f} s after the first scan"
-        yield f"{words_of(mine)}, {when}: it was lost, or they jumped"
+        yield f"{words_of(mine)}, first {_since_first(run, mine[0].t_ns)}: it was lost, or they jumped"
 
 
-def _diverged(_: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _diverged(_: Recording, summary: Summary) -> Iterator[str]:
     lost = [name for name, figures in summary["robots"].items() if figures.get("diverged")]
     if lost:
         names = ", ".join(lost)
@@ -303,7 +300,7 @@ def words_of(placed: list[RelocatedRobot]) -> str:
     return f"readings of {placed[0].sensor} that agree moved {placed[0].robot} by {far}"
 
 
-def _observations(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _observations(run: Recording, summary: Summary) -> Iterator[str]:
     history, total = run.history, int(summary["observations"])
     yield from _unused(run)
     if not total and history.scans:
@@ -346,7 +343,7 @@ def _unused(run: Recording) -> Iterator[str]:
         yield "nothing was observed twice: no observation checks another one"
 
 
-def _images(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
+def _images(run: Recording, _: Summary) -> Iterator[str]:
     """Yield warnings of cameras whose measurements lie outside their images."""
     history = run.history
     robots = history.robot[history.step]
@@ -365,7 +362,7 @@ def _images(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _robots(run: Recording, summary: Summary) -> Iterator[str]:
     history = run.history
     for name in history.robots:
         mine = history.robot == name
@@ -382,15 +379,15 @@ def _robots(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
                 yield f"controls of robot {name} cover {share:.0%} {of}: are both in seconds?"
 
 
-def _sensors(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _sensors(run: Recording, summary: Summary) -> Iterator[str]:
     """Yield the configured sensors that no observation was by."""
-    robots: Mapping[str, Any] = run.config.get("robots") or {}
+    robots: Section = run.config.get("robots") or {}
     rows = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
     seen = set(rows)
     for key, given in robots.items() if seen and not run.stopped else ():
         mine = [name for name in run.log.robots if name == key or (key == "each" and name not in robots)]
         used = sorted({sensor for robot, sensor in seen if robot in mine})
-        configured: Mapping[str, Any] = (given or {}).get("sensors") or {}
+        configured: Section = (given or {}).get("sensors") or {}
         for name, section in configured.items() if mine else ():
             if name not in used and (section or {}).get("type") != NOTICES:
                 near = get_close_matches(name, used, n=1, cutoff=0.5)
@@ -398,7 +395,7 @@ def _sensors(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
                 yield f"no observation is by the sensor {name} of {', '.join(mine)}, which is configured{hint}"
 
 
-def _truth(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _truth(run: Recording, summary: Summary) -> Iterator[str]:
     if no_ids(run) and not summary.get("landmarks_matched"):
         yield (
             "the landmarks are not scored: no ids tie them to the true ones, and less than half of them (or less than "
@@ -429,22 +426,20 @@ def _some(names: set[str]) -> str:
     return ", ".join(first) + (", ..." if len(names) > len(first) else "")
 
 
-def _first_fixes(run: Recording, _: Mapping[str, Any]) -> Iterator[str]:
+def _first_fixes(run: Recording, _: Summary) -> Iterator[str]:
     fixes = run.history.fixes
     starts = {start.robot: start for start in run.history.starts}
     for name in dict.fromkeys(fix.robot for fix in fixes):
         first = next(fix for fix in fixes if fix.robot == name)
         if name in starts and _d2(first) > gate(FIRST_FIX, len(first.z)):
-            far = float(np.linalg.norm(first.z))
-            d = len(first.z)
-            sigma = float(np.sqrt(max(np.trace(starts[name].covariance[:d, :d]) / d, 0.0)))
+            far, sigma = float(np.linalg.norm(first.z)), float(place_sigma(starts[name].covariance, len(first.z)))
             yield (
                 f"the first fix of {name} is {figure(far)} m from where its start puts it, "
                 f"with a configured sigma of {figure(sigma)} m: set robots.{name}.start"
             )
 
 
-def _fixes(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _fixes(run: Recording, summary: Summary) -> Iterator[str]:
     value = summary.get("fix_nis_per_dof")
     if value is not None and value > FIX_NIS_HIGH and summary["fixes"] >= FEW_FIXES:
         yield f"NIS per degree of freedom of the fixes is {figure(value)} where 1 is consistent: too small a noise?"
@@ -462,13 +457,13 @@ def _d2(fix: UsedFix) -> float:
     return float(fix.z @ np.linalg.solve(fix.Z, fix.z))
 
 
-def is_overconfident(figures: Mapping[str, Any]) -> bool:
+def is_overconfident(figures: Summary) -> bool:
     """Return whether the truth shows a robot's pose to be off by more than its covariance."""
     value, most = figures.get("pose_nees"), figures.get("pose_nees_most")
     return value is not None and most is not None and value > most
 
 
-def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _noise(run: Recording, summary: Summary) -> Iterator[str]:
     dof = summary["pose_dof"]
     for name, figures in summary["robots"].items():
         value = figures.get("pose_nees")
@@ -484,7 +479,7 @@ def _noise(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"NIS per degree of freedom {figure(value, 2)} where 1 is consistent: {TOO_SMALL}"
 
 
-def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[str]:
+def _stated_too_large(run: Recording, summary: Summary) -> Iterator[str]:
     history = run.history
     if summary["diverged"] or any(map(is_overconfident, summary["robots"].values())):
         return
@@ -497,7 +492,7 @@ def _stated_too_large(run: Recording, summary: Mapping[str, Any]) -> Iterator[st
             yield from _compared(history, sensor, mine, columns, _cut_off(run, sections, dof))
 
 
-def _fixes_stated_too_large(summary: Mapping[str, Any]) -> Iterator[str]:
+def _fixes_stated_too_large(summary: Summary) -> Iterator[str]:
     value = summary.get("fix_nis_per_dof")
     if value is not None and value < LOW and summary["fixes"] - summary["fixes_rejected"] >= NUMBER // 2:
         yield (
@@ -506,7 +501,7 @@ def _fixes_stated_too_large(summary: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _cut_off(run: Recording, sections: list[dict[str, Any]], dof: int) -> float:
+def _cut_off(run: Recording, sections: list[Section], dof: int) -> float:
     """Return the variance of innovations of `dof` numbers that the gate of a sensor's association leaves of one."""
     own = next((section["association"] for section in sections if section.get("association")), None)
     share = (own or run.config.get("association") or {}).get("gate")

@@ -20,10 +20,11 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import PluginError
+from kalmark.geometry.gaussian import contours, is_finite
 from kalmark.geometry.rotations import from_matrix
 from kalmark.logs.log import poses_of_size
 from kalmark.picture_options import Picture
-from kalmark.results.measures import anees_interval
+from kalmark.results.measures import anees_interval, sigmas
 from kalmark.results.plot import BEHIND, GROUPS, VIEWS
 from kalmark.results.scene import (
     EXPECTED,
@@ -33,7 +34,6 @@ from kalmark.results.scene import (
     Image,
     Scene,
     colour_of,
-    contours,
     sides_of,
     squares,
 )
@@ -61,7 +61,7 @@ class Stream:
         self.rr: Any = rerun
         self.recording = rerun.RecordingStream("kalmark", recording_id=name or None)
         self.path, self.d, self.size, self.last = path, scene.d, scene.size, dict[str, Array]()
-        self.picture, self.colours = scene.picture, {robot: scene.colour(robot) for robot in scene.paths}
+        self.picture, self.colours = scene.picture, {robot: scene.colour(robot) for robot in scene.ways}
         if path is None:
             self.recording.connect_grpc(start_viewer(scene.picture.width_px))
         else:
@@ -82,11 +82,11 @@ class Stream:
         """Log what does not change: the bodies of robots, true landmarks, names of curves and the arrangement."""
         rr, true = self.rr, rgb(scene.picture.colour("truth", TRUTH_COLOUR))
         self.put("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for robot in scene.paths:
+        for robot in scene.ways:
             colour, lines = scene.colour(robot), scene.body(robot)
             body = rr.LineStrips3D(lines, colors=rgb(colour), radii=LINE)
             self.put(f"map/robots/{robot}/body", body, static=True)
-            if len(scene.paths) > 1:
+            if len(scene.ways) > 1:
                 name = rr.Points3D([[0.0, 0.0, 0.0]], colors=rgb(colour), labels=[robot], show_labels=True, radii=LINE)
                 self.put(f"map/robots/{robot}/name", name, static=True)
             if scene.picture.truth:
@@ -121,8 +121,8 @@ class Stream:
                 for timeline in ("time", "step")
             ]
         )
-        paths = [f"map/paths/{robot}" for robot in scene.paths] + [f"map/true_paths/{robot}" for robot in scene.paths]
-        view, first = scene.picture.view, next(iter(scene.paths))
+        paths = [f"map/paths/{robot}" for robot in scene.ways] + [f"map/true_paths/{robot}" for robot in scene.ways]
+        view, first = scene.picture.view, next(iter(scene.ways))
         behind, (position, target, up) = view == "self" and self.d == 3, eye_of(scene)
         if behind:
             offset, axes = eye_behind(scene.size)
@@ -149,7 +149,7 @@ class Stream:
                 curves(f"sigma/{robot}/rotation", turn, False),
                 name=robot,
             )
-            for robot in scene.paths
+            for robot in scene.ways
         ]
         figures = [
             curves("consistency/NEES", "NEES of the pose and its 95 % band", False),
@@ -180,7 +180,7 @@ class Stream:
         if self.picture.ellipses != "off":
             ellipsoid = self._ellipsoids(pose[None, : self.d], P[None, : self.d, : self.d], rgb(colour))
             self.put(f"map/robot_ellipses/{name}", ellipsoid)
-        sigma = np.sqrt(np.maximum(np.diagonal(P), 0.0))
+        sigma = sigmas(P)
         self.put(f"sigma/{name}/position", rr.Scalars(sigma[: self.d]))
         self.put(f"sigma/{name}/rotation", rr.Scalars(sigma[self.d :]))
         if np.isfinite(true).all() and self.picture.truth:
@@ -202,7 +202,7 @@ class Stream:
         rr, shapes = self.rr, scene.shapes
         plane = self.d == 2
         colours = [scene.picture.colour(name, usual) for usual, name, _ in GROUPS[self.d]]
-        known = np.isfinite(shapes.means).all(axis=1) & np.isfinite(shapes.covariances).all(axis=(1, 2))
+        known = is_finite(shapes.means, shapes.covariances)
         mine = np.array([rgb(colours[group]) for group in shapes.group[known].tolist()]).reshape(-1, 3)
         names = [str(scene.ids[row]) for row in shapes.row[known].tolist()]
         points = rr.Points3D(
@@ -297,10 +297,6 @@ class Stream:
         if dof:
             self.put("consistency/NIS", self.rr.Scalars([value / dof, 1.0]))
 
-    def flush(self) -> None:
-        """Send all that is still here."""
-        self.recording.flush()
-
 
 def xyz(points: Array) -> Array:
     """Return points (N, 2 or 3) in three dimensions (N, 3), those of the plane at z = 0."""
@@ -318,7 +314,7 @@ def light_colours(scene: Scene) -> Picture:
     """Return the picture's options with usual colours that are mixed with white: the viewer is dark."""
     usual = {name: colour for colour, name, _ in GROUPS[scene.d]}
     usual |= {name: colour for name, colour, _ in EXPECTED.values()} | {
-        robot: scene.colour(robot) for robot in scene.paths
+        robot: scene.colour(robot) for robot in scene.ways
     }
     light = {name: "#" + bytes(round(0.6 * part + 102) for part in rgb(colour)).hex() for name, colour in usual.items()}
     return replace(scene.picture, colours=light | dict(scene.picture.colours or {}))

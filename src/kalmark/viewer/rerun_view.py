@@ -21,7 +21,7 @@ from kalmark.results.camera_images import Pictures
 from kalmark.results.filter_description import mount_now, observed_points
 from kalmark.results.filter_picture import scene_of_filter, truth_to_map
 from kalmark.results.history import WHOLE
-from kalmark.results.measures import nees, nis, pose_error
+from kalmark.results.measures import associated_nis, nees, nis, pose_error
 from kalmark.results.recording import Recording
 from kalmark.results.scene import Ray, Scene, images, images_of_report, map_shapes, picture_of, steps_of
 from kalmark.results.truth import as_rigid
@@ -110,9 +110,8 @@ def replay(run: Recording, save: Path | None = None) -> None:
     truth, maps = run.truth.poses_in_map(), {kept.step: kept for kept in history.maps}
     error = pose_error(history.poses, truth, run.coordinates)
     consistency = np.where(np.isfinite(error).all(axis=1), nees(np.nan_to_num(error), history.pose_covariances), np.nan)
-    used = history.outcome == "associated"
-    value, dof = nis(history.z[used], history.Z[used])
-    totals = [np.bincount(history.step[used][dof > 0], x[dof > 0], len(history.t_ns)) for x in (value, dof)]
+    value, dof, at = associated_nis(history)
+    totals = [np.bincount(at, x, len(history.t_ns)) for x in (value, dof)]
     of_cameras = [(camera, {*steps_of(history, camera).tolist()}) for camera in history.cameras]
     places: dict[str, Array] = {}
     for step in track(range(len(history.t_ns)), "view", len(history.t_ns), show=True):
@@ -134,7 +133,7 @@ def replay(run: Recording, save: Path | None = None) -> None:
     if slam is not None and len(history.t_ns):
         mapped = slam.landmarks(exactly_known=False).ids
         stream.correlations(slam.covariance(*slam.robots, *mapped[:MOST]))
-    stream.flush()
+    stream.recording.flush()
 
 
 def _rays(run: Recording, slam: Slam | None, step: int, places: dict[str, Array]) -> list[Ray]:
@@ -146,7 +145,7 @@ def _rays(run: Recording, slam: Slam | None, step: int, places: dict[str, Array]
     pose, robot, sensor = history.poses[step], str(history.robot[step]), str(history.sensor[rows[0]])
     at, seen_at = pose[:d], history.seen_at[rows]
     if slam is not None and sensor in slam.robots[robot].sensors:
-        mount = mount_now(slam, robot, sensor, slam.robots[robot].sensors[sensor].at)
+        mount = mount_now(slam, robot, sensor)
         at = as_rigid(pose[: len(mount)])(mount[:d])
         seen_at = observed_points(slam, robot, sensor, pose, history.y[rows])
     unknown = np.full(d, np.nan)
