@@ -71,7 +71,7 @@ def main() -> None:
         runs = [carried_runs(WORLDS[world], ids, seed) for seed in range(args.runs)]
         lasts = [gap.lasts_s for _, gaps, _, _ in runs for gap in gaps] or [np.nan]
         print(
-            f"{world:12} {'ids' if ids else 'no ids':6}: found {sum(found for found, *_ in runs)} of {len(runs)}, "
+            f"{world:12} {'ids' if ids else 'no ids':6} found {sum(found for found, *_ in runs)} of {len(runs)}, "
             f"after {np.median(lasts):.1f} s, at most {max(lasts):.1f} s; "
             f"false alarms {sum(len(c) for _, _, c, _ in runs)}; "
             f"maps with something twice {sum(twice > 0 for *_, twice in runs)}",

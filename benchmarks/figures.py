@@ -437,6 +437,10 @@ def gaps() -> Iterator[Figure]:
                  row("total", "{0} of {1}"))  # fmt: skip
     yield Figure(section, "pillars in rows: wrong maps that the verdict calls ok / right ones that it does not", "0 / 0",
                  command, row("total", "{2} / {3}"))  # fmt: skip
+    section, command = "A robot that is elsewhere", "python benchmarks/carried.py"
+    for world, ids in itertools.product(("random_field", "sparse", "dense"), ("ids", "no ids")):
+        yield Figure(section, f"carried away, `{world}`, {ids}: found / after, at most / false alarms / maps with something twice",
+                     "95 % / 30 s / 0 / 0", command, row(f"{world} {ids}", "{1} of {3} / {9} s / {13} / {18}"))  # fmt: skip
     section, command = "Walls", "python benchmarks/walls.py"
     for name, wanted in (("invariant", ("3 / 90 %", "0 / 0")), ("ekf", ("", ""))):
         yield Figure(section, f"hall of walls and corners, raw laser, no ids, 50 runs, `{name}`: pose ANEES / steps in its band",

@@ -16,7 +16,6 @@ from kalmark.config import build_slam
 from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.logs.log import Log
-from kalmark.logs.log_corrections import event_at_time
 from kalmark.simulate import load_world, simulate
 
 Plant = Callable[[Log], Log]
@@ -35,7 +34,7 @@ def scans(change: Callable[[Array], Array], robot: str = "", late_s: float = 0.0
 def carried(log: Log) -> Log:
     """Leave out a fifth of the log: the robot is elsewhere when it comes again."""
     begin, end = (log.events[k * len(log.events) // 5].t_ns for k in (2, 3))
-    rest = [event_at_time(e, e.t_ns - end + begin) for e in log.events if e.t_ns >= end]
+    rest = [replace(e, t_ns=e.t_ns - end + begin) for e in log.events if e.t_ns >= end]
     return replace(log, events=[*(e for e in log.events if e.t_ns < begin), *rest])
 
 

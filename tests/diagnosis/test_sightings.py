@@ -114,6 +114,7 @@ def test_a_noise_that_is_stated_too_small_splits_landmarks() -> None:
     assert names[0] == "range_sigma" and "split_landmarks" in names
 
 
+@pytest.mark.usefixtures("never_found")
 def test_scans_that_are_late_are_named_before_the_map_that_they_double_by_the_verdict_of_a_run() -> None:
     log = hall(2, bad_wheel=False)
     late = [

@@ -1,10 +1,10 @@
 """The pose of a sensor among known landmarks, without a prior of it.  [T] exercise 1, [F].
 
-*By ids*: as few landmarks as determine a pose are chosen by lot, the pose with which most others agree is taken; a tag
-determines one alone.  *By distances*: two observed places and two landmarks as far from each other determine a pose of
-the plane.  Each such pose is tested with all of the scan: how many places are at landmarks (RANSAC of Fischler and
-Bolles 1981, but every pair is tried).  The best one is taken if a matching as good is not expected by chance and none
-from elsewhere comes near it; else a later scan decides.
+*By ids*: points or directions determine a pose by least squares, with which all have to agree; a tag determines one
+alone, that with which most others agree is taken.  *By distances*: two observed places and two landmarks as far from
+each other determine a pose of the plane.  Each such pose is tested with all of the scan: how many places are at
+landmarks (RANSAC of Fischler and Bolles 1981, but every pair is tried).  The best one is taken if a matching as good is
+not expected by chance and none from elsewhere comes near it; else a later scan decides.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ FEWEST = 3  # pairs without ids
 FEWEST_NAMED = {2: 2, 3: 3}  # with ids, by the dimensions of the world
 FEWEST_RAYS = {2: 3, 3: 6}  # directions with ids
 STEPS = 5  # of least squares
-LOTS = 32  # of so few pairs that are drawn
 LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
 SURE = 7.0  # the most that one landmark counts: log odds
 BASES = 8  # pairs of observations from which poses are computed
@@ -69,7 +68,7 @@ def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -
     """Return the pose that points v (K, d) with these ids and sigmas (K,) determine, or why they do not."""
     rows, d = rows_of(of, ids), v.shape[1]
     if d == 3 or (rows >= 0).sum() >= FEWEST_NAMED[d]:
-        return _most_agreeing(of, rows, FEWEST_NAMED[d], _Points(v, sigma))
+        return _by_ids(of, rows, FEWEST_NAMED[d], _Points(v, sigma))
     unnamed = np.array([k for k, i in enumerate(ids) if i is None], dtype=np.int64)
     found = search(of, v[unnamed], sigma[unnamed])
     if isinstance(found, str):
@@ -84,7 +83,7 @@ def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -
 
 def locate_rays(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:
     """Return the pose that unit vectors v (K, d) with these ids and sigmas (K,), rad, determine, or why they do not."""
-    return _most_agreeing(of, rows_of(of, ids), FEWEST_RAYS[v.shape[1]], _Rays(v, sigma))
+    return _by_ids(of, rows_of(of, ids), FEWEST_RAYS[v.shape[1]], _Rays(v, sigma))
 
 
 class _Points(NamedTuple):
@@ -151,27 +150,15 @@ def rows_of(of: Known, ids: Sequence[Id | None]) -> Index:
     return np.array([-1 if name is None else at.get(name, -1) for name in ids], dtype=np.int64)
 
 
-def _most_agreeing(of: Known, rows: Index, fewest: int, seen: _Points | _Rays) -> Proposal | str:
-    """Return the pose with which most observations of landmarks `rows` (K,) agree; so few of them determine one."""
-    some, l, rng = np.flatnonzero(rows >= 0), of.places()[rows], np.random.default_rng(0)
+def _by_ids(of: Known, rows: Index, fewest: int, seen: _Points | _Rays) -> Proposal | str:
+    """Return the pose with which all observations of landmarks `rows` (K,) agree; so few of them determine one."""
+    some, l = np.flatnonzero(rows >= 0), of.places()[rows]
     if len(some) < fewest:
         return f"its scan has {len(some)} landmarks with ids, a pose by these needs {fewest}"
-    pose, best = np.zeros(0), some[:0]
-    for lot in range(LOTS):
-        chosen = some if lot == 0 else rng.choice(some, fewest, replace=False)
-        for _ in range(2):  # the second time by all that agree
-            T = seen.solve(l, chosen)
-            near = some[seen.misfits(T, l, some) <= 1.0]
-            chosen = near if len(near) >= fewest else chosen
-        if len(best) < len(near):
-            pose, best = T, near
-        if len(best) == len(some):
-            break
-    if len(best) < fewest:
+    T = seen.solve(l, some)
+    if (seen.misfits(T, l, some) > 1.0).any():
         return f"its {len(some)} landmarks with ids do not agree on a pose"
-    matched = np.full(len(rows), -1)
-    matched[best] = rows[best]
-    return Proposal(pose, seen.covariance(pose, l, best), matched, SURE * (len(best) - fewest))
+    return Proposal(T, seen.covariance(T, l, some), rows, SURE * (len(some) - fewest))
 
 
 def locate_tags(of: Known, ids: Sequence[Id | None], v: Array, cov: Array) -> Proposal | str:

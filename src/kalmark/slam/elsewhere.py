@@ -53,18 +53,28 @@ def concerns(scan: ScanContext) -> bool:
     return is_known and (channel.gives_rays or (channel.gives_places and channel.landmark.kind in ("point3", "tag")))
 
 
-def correct(
-    state: State, scan: ScanContext, names: Sequence[Any], update: Update, estimator: Estimator | None = None
-) -> Correction:
-    """Correct the map; observations with ids that are far off are used if others fit and their gate lets them.
+def limit_of(state: State, scan: ScanContext) -> float:
+    """Return the d2 up to which an observation with an id is not far off; infinite where the gate is switched off.
 
-    A filter that is too sure may be off by `WIDER` times its sigmas: only what is farther is far off, and what would be
-    behind a camera.  Where the gate is switched off all are used.
+    A filter that is too sure may be off by `WIDER` times its sigmas.
     """
     is_off = state.policies[scan.key].association.threshold(1, 0.0) == math.inf
     if scan.event.ids is None or is_off or not concerns(scan):
+        return math.inf
+    return WIDER**2 * gate(SURVEYED, scan.channel.dof)
+
+
+def correct(
+    state: State, scan: ScanContext, names: Sequence[Any], update: Update, estimator: Estimator | None = None
+) -> Correction:
+    """Correct the map; observations with ids beyond `limit_of`, or of what cannot be seen from here, are far off.
+
+    These are held back while no landmark as old fits.  If one does, and after `HELD` scans of several that lead to no
+    pose, they are used where their gate lets them.
+    """
+    limit = limit_of(state, scan)
+    if limit == math.inf:
         return state.corrected(update, scan.event, estimator)
-    limit = WIDER**2 * gate(SURVEYED, scan.channel.dof)
     done = state.corrected(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
     far = _far(scan, update, done, limit)
     if not far:
@@ -76,7 +86,7 @@ def correct(
     of.weigh()
     out = [k for k in far if done.d2[k] <= update.gate]
     of.held += len(of.missed) >= SEVERAL and not of.fitted
-    if of.ratio >= 0.0 or of.held <= HELD or not out:
+    if (of.ratio < 0.0 and of.held <= HELD) or not out:
         return done
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
     fused = done.fused.copy()
@@ -112,9 +122,10 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
         del state.evidence[robot]
     if of.ratio <= -SURE:
         old, is_look = _old(state, scan, of), look is not None or scan.adrift or all_named
-        if is_look and not (of.fitted and robot in state.alternatives):
+        is_tried = of.fitted and robot in state.alternatives
+        if is_look and not is_tried:
             _propose(state, scan, of, old)
-        if of.fitted and robot in state.alternatives:
+        if of.fitted and robot in state.alternatives and (is_tried or all_named):
             _try(state, scan, of, old)
     elif of.fitted:
         state.alternatives.pop(robot, None)

@@ -59,7 +59,8 @@ def correct_by_surveys(
     lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
     if elsewhere.concerns(scan) or ((lost or state.surveys.contradict()) and is_doubted(state, scan)):
         lost = False
-    out = np.array([k for k in beyond if (lost or not tried[k]) and done.d2[k] <= update.gate], dtype=np.int64)
+    most = min(update.gate, elsewhere.limit_of(state, scan))
+    out = np.array([k for k in beyond if (lost or not tried[k]) and done.d2[k] <= most], dtype=np.int64)
     if not len(out):
         return done
     before = state.map.mean(scan.robot)
