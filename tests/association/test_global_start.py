@@ -183,3 +183,9 @@ def test_directions_determine_a_pose_if_all_agree(d: int) -> None:
     off = SE2.minus(found.T, pose) if d == 2 else SE3.minus(found.T, pose)
     assert off @ np.linalg.solve(found.cov, off) < 12.0
     assert isinstance(locate_rays(of, [0, 1], v[:2], np.full(2, 0.002)), str)
+
+
+def test_landmarks_with_ids_that_stand_in_one_place_determine_no_pose() -> None:
+    here = known(np.zeros((3, 2)))
+    assert isinstance(locate_rays(here, [0, 1, 2], np.tile([1.0, 0.0], (3, 1)), np.full(3, 0.01)), str)
+    assert isinstance(locate_rays(here, [0, 1, 2], np.full((3, 2), np.nan), np.full(3, 0.01)), str)

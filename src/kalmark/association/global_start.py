@@ -155,10 +155,13 @@ def _by_ids(of: Known, rows: Index, fewest: int, seen: _Points | _Rays) -> Propo
     some, l = np.flatnonzero(rows >= 0), of.places()[rows]
     if len(some) < fewest:
         return f"its scan has {len(some)} landmarks with ids, a pose by these needs {fewest}"
-    T = seen.solve(l, some)
-    if (seen.misfits(T, l, some) > 1.0).any():
-        return f"its {len(some)} landmarks with ids do not agree on a pose"
-    return Proposal(T, seen.covariance(T, l, some), rows, SURE * (len(some) - fewest))
+    try:
+        T = seen.solve(l, some)
+        if (seen.misfits(T, l, some) > 1.0).any():
+            return f"its {len(some)} landmarks with ids do not agree on a pose"
+        return Proposal(T, seen.covariance(T, l, some), rows, SURE * (len(some) - fewest))
+    except np.linalg.LinAlgError:
+        return f"its {len(some)} landmarks with ids stand where they determine no pose"
 
 
 def locate_tags(of: Known, ids: Sequence[Id | None], v: Array, cov: Array) -> Proposal | str:

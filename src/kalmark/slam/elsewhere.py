@@ -1,8 +1,8 @@
 """A robot that is elsewhere than its filter has it: found by evidence, placed where the log fits better.
 
 A covariance does not show that a robot was carried away.  The log does (`evidence.py`).  From - `SURE` on a pose is
-looked for at which the scan, and what was mapped since the onset, is that of old landmarks: by a tag, by points with
-ids, or by distances (`association/global_start.py`).  A second filter of the robot alone begins there, an
+looked for at which the scan, and what was mapped since the onset, is that of old landmarks: by a tag, by points or
+rays with ids, or by distances (`association/global_start.py`).  A second filter of the robot alone begins there, an
 `Alternative`, on the old map as it is, with the same ratio.  Where both differ by log `ODDS` the robot is placed there;
 what was mapped meanwhile goes.
 """
