@@ -85,7 +85,8 @@ def options(text: str) -> list[Item]:
             if len(cells) > 1 and cells[0] not in ("toolbox", "-") and not cells[0].startswith("---"):
                 state = {"not available": "missing", "not done": "missing", "partly": "partly"}
                 shown = next((s for start, s in state.items() if cells[1].startswith(start)), "works")
-                found.append(Item("TB", f"Settings: {head}", cells[0], cells[1], shown, page, (), ""))
+                why = "" if shown == "works" else f": {cells[2]}"
+                found.append(Item("TB", f"Settings: {head}", cells[0], cells[1] + why, shown, page, (), ""))
     return found
 
 
@@ -106,8 +107,8 @@ def table(all_items: list[Item], pages: dict[str, str]) -> str:
         "# Every item of the four documents\n",
         "Each section, equation, figure, table, program, exercise, slide and option of the",
         "[four documents](../learn.md), with its state here. *works*: kalmark does it, and the page shows it.",
-        "*partly*: a part of it, or no page shows it. *missing*: kalmark does not have it, or it has no page.",
-        "The figures of the documents are [beside ours](figures.md).\n",
+        "*partly*: a part of it, or no page shows it. *missing*: kalmark does not have it; the row says why.",
+        "A page of their own has the [figures of the documents](figures.md), drawn by kalmark.\n",
         "| document | " + " | ".join(STATES) + " | items |\n|---|---|---|---|---|",
     ]
     for seed, title in [*SEEDS.items(), ("", "all")]:
