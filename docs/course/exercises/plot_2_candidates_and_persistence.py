@@ -44,7 +44,7 @@ for p, C in found:
 # landmark. Ellipses are of 2 sigma.
 
 
-def draw(some):
+def draw(some, poses=poses):
     ax = plt.figure(layout="constrained").add_subplot(aspect="equal", xlim=(-1, 12), ylim=(-1, 8))
     for p, C, *persistence in some:
         ax.plot(*km.geometry.ellipse(p, C, 2, 40).T, color="tab:blue" if persistence else "tab:red", lw=1)
@@ -53,7 +53,7 @@ def draw(some):
     ax.set(xlabel="x [m]", ylabel="y [m]")
 
 
-draw(found[:3])
+draw(found[:3], poses[:2])
 
 # %%
 # Two estimates are merged

@@ -56,7 +56,8 @@ for ax, P, title in zip(axes, (before, moved, corrected), titles, strict=True):
     ax.set_title(title)
     ax.set_xticks(range(9), labels)
     ax.set_yticks(range(9), labels)
-    print(f"{title}: sigmas of the robot {np.sqrt(np.diag(P)[:3]).round(3)}")
+    sigmas = np.sqrt(np.diag(P)).round(3)
+    print(f"{title}: sigmas of the robot {sigmas[:3]}, of l₃ {sigmas[7:]}")
 plt.show()
 
 # %%

@@ -55,16 +55,19 @@ def motion(n):
 # heading are nearly linear in the pose, so it fits. The position in the frame is not: an uncertain heading bends the
 # cloud, and the ellipse does not. The end of the motion (x and heading) is linear in its noise.
 figure, axes = plt.subplots(1, 3, figsize=(11, 4), layout="constrained")
-cases = ((distance_heading, r), (place_in_frame, r), (motion, np.zeros(2)))
-for ax, (f, mean) in zip(axes, cases, strict=True):
+cases = (
+    (distance_heading, r, "d [m]", "φ [rad]"),
+    (place_in_frame, r, "$x_v$ [m]", "$y_v$ [m]"),
+    (motion, np.zeros(2), "x [m]", "θ [rad]"),
+)
+for ax, (f, mean, first, second) in zip(axes, cases, strict=True):
     s = sigmas[-len(mean) :]
     y, Y = km.geometry.propagate(f, mean, np.diag(s**2))
     draws = np.array([f(mean + s * n)[0] for n in rng.normal(size=(2000, len(s)))])
     inside = [km.geometry.mahalanobis(one, y, Y) < 2 for one in draws]
     ax.plot(*draws.T, ".", ms=3, alpha=0.3)
     ax.plot(*km.geometry.ellipse(y, Y, sigmas=2, points=60).T, "tab:red")
-    ax.set(title=f"{f.__name__}: {np.mean(inside):.0%} inside", xlabel="first number [m]")
-axes[0].set(ylabel="second number [rad], [m], [rad]")
+    ax.set(title=f"{f.__name__}: {np.mean(inside):.0%} inside", xlabel=first, ylabel=second)
 plt.show()
 
 # %%

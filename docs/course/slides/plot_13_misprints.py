@@ -16,6 +16,9 @@ landmark at :math:`(u, v)` the right ones are, [S] (61)-(64):
   :math:`\operatorname{atan2}(y - u, x - v)`, and have the sign of the direction reversed.
 * The start of a landmark: the slides have sine and cosine exchanged.
 * The distribution of :math:`y_i` is printed with :math:`f(x_i, 0)` as its mean; it is :math:`g(x_i, 0)`.
+
+Two more are in Algorithm 11.3: a missing transpose (:doc:`/lessons/slides/plot_07_kalman_filter`), and an
+:math:`M_i` in the place of :math:`G_x` (:doc:`/lessons/slides/plot_08_extended_kalman_filter`).
 """
 
 # %%

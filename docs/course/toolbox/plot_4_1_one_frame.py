@@ -60,4 +60,5 @@ plt.show()
 #
 # * ``"steps=2"``: the landmarks have just started, and the ellipses are long towards where the depth is unknown.
 # * ``"filter.landmarks.type=inverse_depth"`` beside ``steps``: another parametrisation of the same points.
-# * ``world="house"`` with its line segments: two numbers of each line are measured, not its ends.
+# * Fewer updates: ``"robots.robot.sensors.camera.attention.updates=4"`` beside ``steps``. Four landmarks
+#   correct, and the sigmas of the position are 0.019, 0.011 and 0.010 m in place of 0.019, 0.009 and 0.008 m.
