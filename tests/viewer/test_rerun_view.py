@@ -87,6 +87,20 @@ def test_the_folder_of_a_run_shows_again_what_was_shown_live(files: tuple[Run, P
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
+def test_a_window_is_sent_the_rows_of_a_fifth_of_a_second_together(tmp_path: Path, monkeypatch: Any) -> None:
+    rerun, made = pytest.importorskip("rerun"), list[Any]()
+    new = rerun.RecordingStream
+
+    def recorded(*names: Any, batcher_config: Any, **options: Any) -> Any:
+        made.append(batcher_config)
+        return new(*names, batcher_config=batcher_config, **options)
+
+    monkeypatch.setattr(rerun, "RecordingStream", recorded)
+    log = circle(steps=3)
+    follow(slam_for(log), log, Picture(), tmp_path / "live.rrd")
+    assert made[0].flush_tick.total_seconds() == 0.2
+
+
 def test_options_of_pictures_change_what_is_shown(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     log = circle(steps=4)
