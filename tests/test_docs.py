@@ -101,6 +101,13 @@ def test_every_public_class_and_function_has_an_example() -> None:
     assert not lacking
 
 
+def test_every_public_value_has_a_text_and_every_signature_is_one_that_a_person_reads() -> None:
+    values = {name: thing for name, (_, thing) in EXAMPLES.items() if not api_pages.is_code(thing)}
+    assert [name for name, thing in values.items() if not api_pages.told_of_value(name.split(".")[-1], thing)] == []
+    pages = {name: api_pages.page_of_name("", name.split(".")[-1], thing) for name, (_, thing) in EXAMPLES.items()}
+    assert [name for name, page in pages.items() if "ForwardRef" in page] == []
+
+
 def test_every_model_can_be_made_as_its_page_says() -> None:
     for name, (_, thing) in EXAMPLES.items():
         if registered_name(thing) if isinstance(thing, type) else None:

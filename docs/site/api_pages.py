@@ -4,8 +4,12 @@ Signatures and texts are those of the docstrings; of a declared model its parame
 configuration follow from the declaration.
 """
 
+import ast
 import inspect
+import sys
+from functools import cache
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_origin
 
@@ -107,6 +111,28 @@ def _value(thing: Any) -> str:
     return f"``{value}``" if len(value) < 200 else f"A ``{type(thing).__name__}``."
 
 
+@cache
+def _told(module: str) -> dict[str, str]:
+    """Return the text below the assignment of each name of a module that has one."""
+    body = ast.parse(inspect.getsource(import_module(module))).body
+    return {
+        each.id: inspect.cleandoc(text.value.value)
+        for named, text in pairwise(body)
+        if isinstance(named, ast.Assign | ast.AnnAssign)
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+        and isinstance(text.value.value, str)
+        for each in ast.walk(named)
+        if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)
+    }
+
+
+def told_of_value(name: str, thing: Any) -> str:
+    """Return the text of a public value, "" if it has none, from the module that assigns it."""
+    homes = [key for key, each in [*sys.modules.items()] if key.startswith("kalmark") and vars(each).get(name) is thing]
+    return next(filter(None, (_told(home).get(name, "") for home in homes)), "")
+
+
 def _head(title: str) -> str:
     return f"{title}\n{'=' * len(title)}\n"
 
@@ -140,8 +166,8 @@ def _module(shown: str, module: Any, names: dict[str, str]) -> str:
         if len(groups) > 1:
             parts += [group, "-" * len(group), ""]
         told = [
-            (f":doc:`{n} <{names[n]}>`", rst(_summary(getattr(module, n))) or _value(getattr(module, n)))
-            for n in members
+            (f":doc:`{n} <{names[n]}>`", rst(_summary(thing) or told_of_value(n, thing)) or _value(thing))
+            for n, thing in ((n, getattr(module, n)) for n in members)
         ]
         parts += [_list(told)]
     inner = [other for _, other, _ in PARTS if other.rpartition(".")[0] == shown]
@@ -188,7 +214,7 @@ def page_of_name(shown: str, name: str, thing: Any) -> str:
     elif is_code(thing):
         parts += [f".. py:function:: {name}{signature_of(thing)}", "", _indented(rst(_docstring(thing)))]
     else:
-        parts += [f".. py:data:: {name}", "", _indented(_value(thing))]
+        parts += [f".. py:data:: {name}", "", _indented(rst(told_of_value(name, thing))), "", _indented(_value(thing))]
     return "\n".join([*parts, ""])
 
 

@@ -36,7 +36,7 @@ def plain_names(code: str) -> str:
 
 
 def _plain(one: inspect.Parameter) -> inspect.Parameter:
-    note, default = one.annotation, one.default
+    note, default = getattr(one.annotation, "__forward_arg__", one.annotation), one.default
     if default is not one.empty and not isinstance(default, int | float | str | bool | tuple | None):
         default = Raw("...")
     return one.replace(annotation=Raw(note) if isinstance(note, str) else note, default=default)

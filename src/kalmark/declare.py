@@ -99,13 +99,19 @@ class Within:
 
 
 Number = Annotated[float, Within()]
+"""The type of a parameter: any finite number."""
 NotNegative = Annotated[float, Within(ge=0)]
+"""The type of a parameter: a number of at least 0."""
 Estimated = Annotated[NotNegative, "; above 0 it is in the map and is estimated."]
 """The sigma of what the filter may estimate; its line of documentation ends with this."""
 Positive = Annotated[float, Within(gt=0)]
+"""The type of a parameter: a number above 0."""
 Limit = Annotated[float, Within(gt=0, infinite=True)]
+"""The type of a parameter: a number above 0, or infinity for none."""
 Probability = Annotated[float, Within(gt=0, lt=1)]
+"""The type of a parameter: a probability, neither 0 nor 1."""
 Count = Annotated[int, Within(ge=1)]
+"""The type of a parameter: a whole number of at least 1."""
 
 
 @dataclass(frozen=True)

@@ -229,3 +229,4 @@ DEVICES = {
 MOTIONS = {"mems_imu": INERTIAL_UNIT}
 """Devices that are a motion: `robots.NAME.motion.preset`."""
 ALL = TABLE_2 | DEVICES
+"""All of them, by the names that `preset` has in a configuration."""

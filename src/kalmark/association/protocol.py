@@ -36,6 +36,7 @@ class Answer(Enum):
 
 
 NEW, REMAP, DEFERRED = Answer.NEW, Answer.REMAP, Answer.DEFERRED
+"""An answer in the place of a landmark: see `Answer`."""
 
 
 class Mixture:
@@ -49,6 +50,7 @@ class Mixture:
 
 
 Decision = tuple[Id | Answer | Mixture | None, str]
+"""What an association returns of an observation: its landmark, or an answer, or None; and the reason."""
 
 
 class Matched(NamedTuple):

@@ -284,9 +284,13 @@ class Space:
 
 
 SE2 = Space("SE2", (VECTOR, HEADING))
+"""Poses of the plane: x, y [m] and the heading [rad]."""
 POINT2 = Space("point", (VECTOR,))
+"""Points of the plane: x, y [m]."""
 SE3 = Space("SE3", (VECTOR3, ROTATION))
+"""Poses in space: x, y, z [m] and a quaternion, its real part last; errors have six numbers."""
 POINT3 = Space("point3", (VECTOR3,))
+"""Points in space: x, y, z [m]."""
 MOUNTS = {3: Space("mount", (SCALAR, SCALAR, ANGLE)), 7: Space("mount in space", (SCALAR, SCALAR, SCALAR, TURNED))}
 
 

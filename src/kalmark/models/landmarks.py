@@ -616,4 +616,6 @@ class HomogeneousLine(_DepthsPrior):
 
 
 BUILT_IN = built_in("landmark")
+"""All kinds of landmarks of kalmark."""
 LINES = tuple(kind for kind in BUILT_IN if issubclass(kind, _Line))
+"""Those that are lines in space."""
