@@ -10,6 +10,7 @@ sys.path.insert(0, str(DOCS / "site"))
 os.environ["MPLBACKEND"] = "Agg"
 
 import matplotlib.animation  # noqa: E402
+import sphinx_gallery.notebook  # noqa: E402
 
 import kalmark  # noqa: E402
 import kalmark.compiled  # noqa: E402
@@ -17,6 +18,16 @@ import kalmark.compiled  # noqa: E402
 # The buttons of an animation have the icons of the theme, none of a network
 matplotlib.animation.JS_INCLUDE = re.sub(r"<link[^>]*>", "", matplotlib.animation.JS_INCLUDE)
 kalmark.compiled.COMPILING = ""  # no page shows the note of the compiler
+
+in_markdown = sphinx_gallery.notebook.rst2md
+
+
+def without_links(text, *options):
+    """Return the text of a notebook, which has the names of other pages, since it is no part of the site."""
+    return in_markdown(re.sub(r":doc:`/(?:\w+/)*(\w+)`", r"*\1* of the site", text), *options)
+
+
+sphinx_gallery.notebook.rst2md = without_links
 
 project, author, release = "kalmark", "the authors of kalmark", kalmark.__version__
 copyright = "the authors of kalmark, MIT licence"
