@@ -121,7 +121,7 @@ def table(all_items: list[Item], pages: dict[str, str]) -> str:
         for chapter in dict.fromkeys(each.chapter for each in of_seed):
             out.append(f"### {chapter}\n\n| place | item | state | page | in kalmark |\n|---|---|---|---|---|")
             for each in (one for one in of_seed if one.chapter == chapter):
-                told = re.sub(r"\]\((?!https?:)", "](../", " ".join(filter(None, [each.item, each.note])))
+                told = re.sub(r"\]\((?!https?:)", "](../", ". ".join(filter(None, [each.item, each.note])))
                 names = ", ".join(linked(name, pages) for name in each.names)
                 page = f"[]({target(each.page)})" if each.page else ""
                 out.append(f"| {each.place} | {told} | {each.state} | {page} | {names} |")
