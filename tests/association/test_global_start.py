@@ -122,6 +122,10 @@ def test_a_scan_that_does_not_determine_a_pose_is_refused_with_the_reason() -> N
     assert search(known(PLACES), elsewhere, SIGMA[:3]) == "no pose in the known map explains its scan"
     strange = np.vstack([to_frame(T, PLACES[:3])[0], [[50.0, 50.0], [70.0, -40.0], [-60.0, 33.0]]])
     assert search(known(PLACES), strange, SIGMA) == "at most 3 of its 6 observations agree with a pose in the known map"
+    few = "its scan has 0 landmarks with ids, a pose by these needs 3"
+    assert (
+        locate_rays(Known(km.landmarks.Point2D()), ["a", "b"], corners[:2], SIGMA[:2]) == few
+    )  # before any is in the map
 
 
 @pytest.mark.parametrize("d", [2, 3])

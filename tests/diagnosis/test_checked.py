@@ -11,7 +11,7 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis import doubled_landmarks
-from kalmark.diagnosis.gross_mistakes import fit_of_run
+from kalmark.diagnosis.trials import fit_of_run
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log, Trajectory
 from kalmark.results.evaluate import evaluate

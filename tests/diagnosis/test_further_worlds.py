@@ -71,7 +71,7 @@ CASES: dict[str, tuple[str, Plant, tuple[str, ...], str, str, str]] = {
     # without ids, the scans of fast turns are of no landmark: that they are late shows in the others hardly
     "a laser that is late": (
         "hall_of_walls", scans(lambda y: y, late_s=0.1), ("steps=240",),
-        "doubtful", "scans of robot were made 0.1 s earlier", "log.shift_s.robot=-0.1",
+        "doubtful", "scans of all sensors of robot were made 0.1 s earlier", "log.shift_s.robot=-0.1",
     ),
     "a laser that is carried away": (
         "hall_of_walls", carried, ("steps=400",),
@@ -93,14 +93,12 @@ def test_the_cause_is_named_first(case: str) -> None:
     assert re.search(cure, verdict.causes[0].cure), verdict.causes[0].cure
 
 
-def test_what_a_turn_that_is_too_large_makes_vanish_may_be_because_of_it() -> None:
+def test_what_a_turn_that_is_too_large_makes_vanish_is_explained_by_it() -> None:
     def turned(log: Log) -> Log:
         return replace(
             log, events=[replace(e, u=e.u * [1, 1, 1.08]) if isinstance(e, Control) else e for e in log.events]
         )
 
     verdict = verdict_on("hall_of_walls", turned, "steps=600")
-    causes = {cause.name: cause for cause in verdict.causes}
     assert verdict.causes[0].name == "odometry_turn"
-    assert causes["kidnapped"].evidence.endswith("and maps others, which odometry_turn may do, too")
-    assert not causes["kidnapped"].cure  # to leave out the log from there on would be wrong
+    assert "kidnapped" not in [cause.name for cause in verdict.causes]  # with its cure nothing vanishes

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.diagnosis.gross_mistakes import MOST
+from kalmark.diagnosis.trials import MOST
 from kalmark.diagnosis.verdict import diagnose
 from kalmark.results.evaluate import headline
 from kalmark.results.run import Run

@@ -114,6 +114,26 @@ def test_trees_that_were_felled_do_not_carry_a_robot() -> None:
     assert off.max() < 0.8
 
 
+def test_two_things_with_one_id_and_one_that_drives_about_bend_no_map() -> None:
+    """With ids and no gate: a far sighting is left out while the others of its scan fit."""
+    places, poses = trees(7), path(2)
+    events = log_of(poses, places, 7, True)
+    other, moving = int(np.argmax(np.linalg.norm(places - places[0], axis=1))), 5
+    rng = np.random.default_rng(7)
+    for k, event in enumerate(events):
+        if not isinstance(event, km.Scan):
+            continue
+        assert event.ids is not None
+        y = event.y.copy()
+        for row, name in enumerate(event.ids):
+            y[row] += rng.uniform(-2.0, 2.0, 2) * (1.0, 0.2) if name == moving and len(events) // 4 < k else 0.0
+        ids = [0 if name == other else name for name in event.ids]
+        events[k] = km.Scan(event.t_s, "rover", "laser", y, ids=ids)
+    off, carried = errors(slam_at(poses[0], True), events, poses[1:])
+    assert not carried
+    assert off.max() < 0.8
+
+
 def test_a_lost_robot_goes_on_from_a_file_bit_for_bit(tmp_path: Any) -> None:
     _, events, _ = carried_log(1, False)
     slam = slam_at(path(1)[0], False)

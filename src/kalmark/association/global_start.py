@@ -152,9 +152,10 @@ def rows_of(of: Known, ids: Sequence[Id | None]) -> Index:
 
 def _by_ids(of: Known, rows: Index, fewest: int, seen: _Points | _Rays) -> Proposal | str:
     """Return the pose with which all observations of landmarks `rows` (K,) agree; so few of them determine one."""
-    some, l = np.flatnonzero(rows >= 0), of.places()[rows]
+    some = np.flatnonzero(rows >= 0)
     if len(some) < fewest:
         return f"its scan has {len(some)} landmarks with ids, a pose by these needs {fewest}"
+    l = of.places()[rows]
     try:
         T = seen.solve(l, some)
         if (seen.misfits(T, l, some) > 1.0).any():

@@ -119,7 +119,8 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
         return f"the batched engine has no estimator {config.estimator.type}"
     if type(policy.association) is not ByIdentity or type(channel.landmark) is not Point2D:
         return "the batched engine has points with known ids"
-    if policy.contests or (robot.max_speed_mps, robot.max_turn_radps) != (None, None):
+    is_gated = policy.association.threshold(channel.dof, math.inf) < math.inf
+    if channel.robust is not None or is_gated or (robot.max_speed_mps, robot.max_turn_radps) != (None, None):
         return "the batched engine has no robust weights, no gate that is set, and no limits of its robot"
     plain = mount.attention == EVERYTHING and mount.detector is None and mount.initialization is None
     if not plain or policy.upkeep.p_detect is not None:

@@ -1,8 +1,7 @@
-"""The search for causes of a run: in its batch problem, or a part of it, from the optimum or from a robust solution."""
+"""The search for causes of a run: in its batch problem, or a part of it."""
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,21 +9,19 @@ import numpy as np
 from scipy.special import chdtrc
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import BatchState, Ints
+from kalmark.batch.batch_state import Ints
 from kalmark.batch.data import Associations, BatchInput, replay_events
-from kalmark.batch.problem import Problem
 from kalmark.batch.solver import Batch, optimum
 from kalmark.diagnosis import repeated_events
 from kalmark.diagnosis.cause_search import Search
 from kalmark.diagnosis.error_columns import Where
-from kalmark.diagnosis.gross_mistakes import MISFIT, filter_events, fit_of_run
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.mistakes import with_value
+from kalmark.diagnosis.trials import fit_of_run
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.models.sensors import Wall
-from kalmark.results.batch import batch_input, filtered_map
+from kalmark.results.batch import batch_input
 from kalmark.results.measures import truncated_variance
 from kalmark.results.run import Run
 from kalmark.slam.robot import Mount
@@ -34,20 +31,16 @@ NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the
 EVENTS = 4  # times as many as observations are taken
 SEGMENT = 30  # successive scans of each robot that are taken together where not all are
 MORE = 4  # times as many are taken if the segments do not determine the map, up to `MOST` at the end of a run
-HUBER = 30.0, 10.0, 3.0, 1.5  # sigmas, beyond which observations count less for a robust solution, one after the other
-ROUGHLY = 1e-3  # of the map's size, is its last step
-GATE = 0.9999  # with which a log that does not fit is filtered again
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
 LOOKED_INTO = 3  # segments with the worst scans
 
 
 class Searched(NamedTuple):
-    """A search for causes that is done, and the batch solution that it began at; what is far off may have pulled it."""
+    """A search for causes that is done, and the batch solution that it began at."""
 
     search: Search
     batch: Batch
     given: BatchInput
-    pulled: bool = False
 
 
 def search_causes(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
@@ -65,50 +58,10 @@ def search_causes(run: Run, log: Log, most: int, limit: int, progress: bool) -> 
     except KalmarkError:
         if given is not every and min(MORE * most, len(every.associations.landmark)) <= limit:
             return search_causes(run, log, MORE * most, limit, progress)
-        found = searched_robustly(run, log, subsample(run, filter_with_gate(run, log, every), most), progress)
-        if found is None:
-            raise
-        return found
+        raise
     search = Search(Linear.of(problem, batch.state, gated_noise_factors(run)), sensors_of(run), given.t_ns)
     search.run(progress)
-    if any(f.rows is not None for f in search.found) and fit_of_run(run).mean > MISFIT:  # they have pulled the solution
-        again = searched_robustly(run, log, subsample(run, filter_with_gate(run, log, every), most), progress)
-        return again or Searched(search, batch, given)
     return Searched(search, batch, given)
-
-
-def searched_robustly(run: Run, log: Log, given: BatchInput, progress: bool) -> Searched | None:
-    """Search for causes from a robust solution, with what is far off there taken out first; None if it has none."""
-    problem = replay_events(given, log)
-    batch = robust(problem, problem.start)
-    if batch is None:
-        return None
-    search = Search(Linear.of(problem, batch.state, gated_noise_factors(run)), sensors_of(run), given.t_ns)
-    search.take_outliers()
-    search.run(progress)
-    return Searched(search, batch, given, pulled=True)
-
-
-def filter_with_gate(run: Run, log: Log, given: BatchInput) -> BatchInput:
-    """Return it with the path and the map of the log filtered again with a gate: what is far off pulls these less."""
-    if (run.config.get("association") or {}).get("type") != "identity":
-        return given
-    gated = with_value(run.config, ("association",), {"type": "identity", "gate": GATE})
-    again = filter_events(gated, log, log.events)
-    if again is None or not np.array_equal(again.history.t_ns, given.t_ns):
-        return given
-    return replace(given, poses=batch_input(again).poses, landmarks={**given.landmarks, **filtered_map(again)})
-
-
-def robust(problem: Problem, state: BatchState) -> Batch | None:
-    """Return the solution in which observations beyond fewer and fewer sigmas count less, from a state on, if any."""
-    found = None
-    for huber in HUBER:
-        with suppress(KalmarkError):  # from a better start the next one may be found
-            less = tuple(replace(factor, huber=huber) for factor in problem.factors)
-            found = optimum(replace(problem, factors=less), state, tolerance=ROUGHLY)
-            state = found.state
-    return found
 
 
 def remove_copies(run: Run, given: BatchInput) -> BatchInput:

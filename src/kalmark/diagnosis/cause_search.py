@@ -8,14 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import bdtrc
 
-from kalmark.arrays import Array, Flags
-from kalmark.batch.batch_state import LANDMARKS, innovations_and_jacobians
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.error_columns import Where, columns_of, errors_of_all_sensors, rates_of
-from kalmark.diagnosis.linear import OUT, Linear
+from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.turned_mounts import find_turned_mounts
 from kalmark.logs.progress import track
 
@@ -66,7 +63,7 @@ def strongest_findings(sure: list[Finding]) -> list[Finding]:
     return sorted(by_name.values(), key=lambda f: (ORDER.index(f.name) if f.name in ORDER else 0, -f.gain))
 
 
-def _joined(same: list[Finding]) -> Finding:
+def joined(same: list[Finding]) -> Finding:
     """Return the findings of one cause in several rounds as one."""
     first, last = same[0], same[-1]
     value = math.prod(f.value for f in same) if last.unit == causes.TIMES else sum(f.value for f in same)
@@ -85,21 +82,6 @@ class Search:
         self.t_s = ((t_ns - t_ns[:1].sum()) * 1e-9)[order[np.minimum(at, len(order) - 1)]]
         self.found: list[Finding] = []
         self.simulated = linear.simulated(causes.SETS)
-
-    def take_outliers(self) -> None:
-        """Take out what is far off where the problem is linear: at a robust solution, which they do not pull.
-
-        Of a landmark that is mostly far off it is left: that moves.
-        """
-        of, landmark = self.linear.observations, self.linear.rows.landmark
-        for finding in causes.outliers(self.linear, self.t_s, self.linear.at.z):
-            if finding.rows is None or finding.p > ALPHA:
-                continue
-            seen, off = (np.bincount(landmark[mine] + 1) for mine in (slice(None), finding.rows[of]))
-            moves = 2 * np.pad(off, (0, len(seen) - len(off))) > seen
-            far = finding.rows & ~np.isin(np.arange(len(finding.rows)), of[moves[landmark + 1] & (landmark >= 0)])
-            if far.any():
-                self.take(replace(finding, rows=far, noise=np.where(far[of], OUT, 1.0), value=float(far.mean())))
 
     def run(self, progress: bool = False) -> list[Finding]:
         """Return all causes, the one that explains most first.
@@ -177,10 +159,8 @@ class Search:
             finding = self._scaled(finding)
         else:
             self._scale(finding)
-        if finding.name == "outliers" and finding.rows is not None:
-            finding = replace(finding, name=self._outliers(finding.rows))
         same = [f for f in self.found if (f.name, f.of) == (finding.name, finding.of) and f.unit == finding.unit]
-        self.found = [f for f in self.found if f not in same] + [_joined([*same, finding])]
+        self.found = [f for f in self.found if f not in same] + [joined([*same, finding])]
 
     def _beside(self, finding: Finding) -> Finding:
         """Return a systematic error as it is beside the others of its column, and take these out of the data.
@@ -221,43 +201,3 @@ class Search:
     def _scale(self, finding: Finding) -> None:
         self.linear = self.linear.scaled(finding.noise, finding.errors)
         self.simulated = self.linear.simulated(causes.SETS)
-
-    def _outliers(self, far: Any) -> str:
-        """Return "wrong_ids" if many of the observations that are `far` off are of another landmark, else "outliers".
-
-        Where landmarks are close together an observation that is off fits another one by chance.  How often is
-        counted with the errors of other such observations in the place of its own, with random signs.
-        """
-        problem, number, fits, by_chance, first, begin = self.linear.problem, 0, 0, 0.0, 0, 0
-        (poses, places, *_), rng = self.linear.moved().groups, np.random.default_rng(0)
-        for factor in problem.factors:
-            k, p, _ = factor.R.shape
-            noise = self.linear.noise[begin : begin + k * p].reshape(k, p) / OUT  # that of outliers
-            begin += k * p
-            blocks = factor.term.blocks
-            mine = np.flatnonzero(far[first : first + k])[:LOOKED_AT]
-            first += k
-            if blocks[-1].group != LANDMARKS or not factor.sensor[1] or len(blocks) != 2 or not len(mine):
-                continue
-            own = blocks[-1].rows[mine]
-            z = np.empty((len(mine), len(places), p))  # of all landmarks, whitened as of the own one
-            for i, row in enumerate(mine.tolist()):
-                rows, R = np.full(len(places), row), factor.R[row] * np.outer(noise[row], noise[row])
-                off, _ = innovations_and_jacobians(factor.view, poses[blocks[0].rows[rows]], places, factor.y[rows])
-                z[i] = np.linalg.solve(np.linalg.cholesky(R), off.T).T
-            error = z[np.arange(len(mine)), own].copy()
-            z[np.arange(len(mine)), own] = np.nan
-            number, fits = number + len(mine), fits + int(_near(z).sum())
-            for _ in range(DRAWS):
-                drawn = rng.permutation(error) * rng.choice([-1.0, 1.0], error.shape)
-                by_chance += float(_near(z + (drawn - error)[:, None]).sum()) / DRAWS
-        if not number or fits <= by_chance:
-            return "outliers"
-        chance = by_chance / number
-        surely = bdtrc(fits - 1, number, chance) < ALPHA
-        return "wrong_ids" if surely and fits - by_chance > MANY * (number - by_chance) else "outliers"
-
-
-def _near(z: Array) -> Flags:
-    """Return which observations (K,) fit any landmark, by their whitened innovations z (K, n, p)."""
-    return np.asarray((np.nan_to_num(np.sum(z**2, axis=2), nan=np.inf) < NEAR).any(axis=1))

@@ -15,10 +15,10 @@ from kalmark.results.figure_texts import figure
 from kalmark.slam.gaps import MARGIN
 
 Words = tuple[str, str]  # evidence, cure
+OR = "; or: "  # between the cures of causes of which each explains as much
 MOST_SIGMAS = 1e4
 RANGE = "range_m"  # the column whose scale and offset a sensor may have
 DISPARITY, INVERSE = "ur_px", "rho_per_m"  # columns that have the scale of distances through a baseline, and inversely
-UNKNOWN_IDS = "--set log.ids=hidden --set association.type=auto"
 CALIBRATIONS = {  # the keys that put an error of a column of the controls into the map, by its kind
     ("v_mps", "offset"): "sigma_v_bias_mps",
     ("w_radps", "offset"): "sigma_w_bias_radps",
@@ -51,11 +51,13 @@ def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
 
     `config` is the configuration of the run: a new noise is given as a number where it states the old one.
     """
-    tell = _TELL.get(finding.name) or (_noise if finding.unit == TIMES else _offset)
-    evidence, cure = tell(finding, config)
+    text = _TELL.get(finding.name) or (_noise if finding.unit == TIMES else _offset)
+    evidence, cure = text(finding, config)
     if finding.alike:
         others = ", ".join(f"{other.name} {_value(other)}" for other in finding.alike)
         evidence += f"; the log cannot tell this from {others}"
+        cures = (cure, *(finding_text(other, config)[1] for other in finding.alike))
+        cure = OR.join(dict.fromkeys(line for line in cures if line))
     return evidence, cure
 
 
@@ -156,7 +158,8 @@ def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
-    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say ({_sure(finding)})"
+    sure = f" ({_sure(finding)})" if finding.sigma > 0.0 else ""
+    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say{sure}"
     where = finding.of[:1] if finding.of[1] == ALL else finding.of[:2]
     return evidence, log_correction_line(config, "shift_s", where, finding.value)
 
@@ -236,12 +239,6 @@ def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
     return f"{finding.value:.1%} of the observations are far off where their landmark is", ""
 
 
-def _wrong_ids(finding: Finding, config: Mapping[str, Any]) -> Words:
-    off = f"{finding.value:.1%} of the observations are far off where their landmark is"
-    evidence = f"{off}, and fit another one far more often than by chance"
-    return evidence, UNKNOWN_IDS
-
-
 def _jump(finding: Finding) -> str:
     """Return the size of a jump with its sigma, as a text."""
     far_m, turn_deg = step_size(np.zeros(3) if finding.at is None else finding.at)
@@ -299,7 +296,6 @@ _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "moving_landmark": _moving,
     "landmark_prior": _landmark_prior,
     "outliers": _outliers,
-    "wrong_ids": _wrong_ids,
     "kidnapped": _kidnapped,
     "odometry_jump": _odometry_jump,
     "start": _noise,

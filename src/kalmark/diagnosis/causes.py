@@ -240,10 +240,10 @@ def correlations(
 
 
 # ------------------------------------------------------------------ single observations, landmarks and steps
-def outliers(linear: Linear, t_s: Array, r: Array | None = None) -> list[Finding]:
-    """Return how much better a mixture with few observations of a far wider noise explains what is left, or r (N,)."""
+def outliers(linear: Linear, t_s: Array) -> list[Finding]:
+    """Return how much better a mixture with few observations of a far wider noise explains what is left."""
     of = linear.observations
-    d2, m = np.bincount(of, (linear.residuals.r if r is None else r) ** 2), np.bincount(of)
+    d2, m = np.bincount(of, linear.residuals.r**2), np.bincount(of)
     if not len(d2):
         return []
     d2[of[linear.surveys]] = 0.0  # a survey that is off is a cause of its own

@@ -15,7 +15,7 @@ from scipy.special import chdtr
 
 from kalmark.arrays import Array
 from kalmark.batch.batch_state import Ints
-from kalmark.diagnosis.gross_mistakes import SAME
+from kalmark.diagnosis.single_ids import SAME
 from kalmark.geometry.angles import wrap
 from kalmark.results.run import Run
 

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Flags
-from kalmark.diagnosis.gross_mistakes import FITS, MUCH, WINDOW, fit_of_run
+from kalmark.diagnosis.gross_mistakes import MUCH, WINDOW
+from kalmark.diagnosis.trials import FITS, fit_of_run
 from kalmark.results.checked import DOUBTFUL, UNCHECKED, Sign
 from kalmark.results.control_gaps import KNOWN
 from kalmark.results.figure_texts import figure

@@ -38,8 +38,9 @@ class Mistake(NamedTuple):
     """Mistake that may have been made: its name, description, cure, and the configuration and log without it.
 
     `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
-    `since_s` since when it counts, in s of the log.  `share` of the landmarks is concerned.  `shrunk` has the sensors
+    `since_s` since when it counts, in s of the log.  `shrunk` has the sensors
     of which a measurement is smaller without it, and the logarithm of by how much: its noise then explains more.
+    `value` is its size, if it has one.
     """
 
     name: str
@@ -49,8 +50,8 @@ class Mistake(NamedTuple):
     change: Change | None = None
     gain: float = 0.0
     since_s: float = 0.0
-    share: float = 1.0
     shrunk: Mapping[Where, float] = {}
+    value: float = 0.0
 
 
 def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
@@ -185,7 +186,7 @@ def late_scans(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
     by_ns = round(by_s * 1e9)
     return Mistake(
         LATE, evidence, cure, config,
-        lambda e: replace(e, t_ns=e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e,
+        lambda e: replace(e, t_ns=e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e, value=by_s,
     )  # fmt: skip
 
 

@@ -17,8 +17,18 @@ from scipy.special import chdtri
 from kalmark.arrays import Array
 from kalmark.diagnosis.cause_search import LEAST_GAIN
 from kalmark.diagnosis.cause_texts import log_correction_line
-from kalmark.diagnosis.gross_mistakes import ALIKE, FITS, MISFIT, MOST, filter_events, first_events
 from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, configured_value, robot_section, with_value
+from kalmark.diagnosis.trials import (
+    FITS,
+    MISFIT,
+    MOST,
+    Fit,
+    filter_events,
+    first_events,
+    first_of,
+    fit_of_run,
+    likelihood_gain,
+)
 from kalmark.events import Event
 from kalmark.geometry.gaussian import quantile
 from kalmark.logs.log import Log
@@ -47,22 +57,20 @@ Told = Callable[["Filtered"], tuple[str, str]]
 
 
 class Filtered(NamedTuple):
-    """A run, and of each of its observations d2, at most `MOST` a number, log det Z, and how many numbers it has."""
+    """A run, and the fit of its observations."""
 
     run: Run
-    d2: Array
-    logdet: Array
-    dof: Array
+    fit: Fit
 
     def of(self, where: Where) -> Ints:
         """Return the rows of a sensor that were judged."""
         h = self.run.history
-        return np.flatnonzero((h.robot[h.step] == where[0]) & (h.sensor == where[1]) & np.isfinite(self.d2))
+        return np.flatnonzero((h.robot[h.step] == where[0]) & (h.sensor == where[1]) & np.isfinite(h.d2))
 
     def sensors(self) -> list[Where]:
         """Return the sensors of the state that made readings which were judged."""
         h = self.run.history
-        mine = h.of_own & np.isfinite(self.d2)
+        mine = h.of_own & np.isfinite(h.d2)
         both = {*zip(h.robot[h.step[mine]].tolist(), h.sensor[mine].tolist(), strict=True)}
         return sorted(both)
 
@@ -75,11 +83,12 @@ class Filtered(NamedTuple):
     def mean(self, where: Where) -> float:
         """Return d2 per degree of freedom of the readings of a sensor."""
         mine = self.of(where)
-        return float(self.d2[mine].sum() / max(self.dof[mine].sum(), 1))
+        dof = self.fit.dof[mine]
+        return float(np.minimum(self.run.history.d2[mine], MOST * dof).sum() / max(dof.sum(), 1))
 
     def off(self) -> list[Where]:
         """Return the sensors of the state whose readings do not fit: that is no chance."""
-        dof = {where: int(self.dof[self.of(where)].sum()) for where in self.sensors()}
+        dof = {where: int(self.fit.dof[self.of(where)].sum()) for where in self.sensors()}
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
 
 
@@ -91,27 +100,7 @@ def filtered_with(config: Mapping[str, Any], log: Log, events: list[Event]) -> F
 
 def fit_of_readings(run: Run) -> Filtered:
     """Return the fit of the observations of a run."""
-    h = run.history
-    known = np.isfinite(h.z)
-    dof = known.sum(axis=1)
-    logdet, d2 = np.full(len(dof), np.nan), np.minimum(h.d2, MOST * dof)
-    for m in np.unique(dof[np.isfinite(d2) & (dof > 0)]).tolist():
-        rows = np.isfinite(d2) & (dof == m)
-        logdet[rows] = np.linalg.slogdet(h.Z[rows][:, :m, :m])[1]
-    return Filtered(run, np.where(np.isfinite(logdet), d2, np.nan), logdet, dof)
-
-
-def likelihood_gain(before: Filtered, after: Filtered, scaled: Where | None = None) -> float:
-    """Return the logarithm of the likelihood ratio of two runs of the same events.
-
-    Readings that are `scaled` do not count themselves: the filter takes the noise of a control for its own, so that
-    their likelihood does not depend on their size.
-    """
-    if len(before.d2) != len(after.d2):
-        return -math.inf
-    both = np.isfinite(before.d2) & np.isfinite(after.d2)
-    both[before.of(scaled) if scaled is not None else []] = False
-    return 0.5 * float((before.d2 + before.logdet - after.d2 - after.logdet)[both].sum())
+    return Filtered(run, fit_of_run(run))
 
 
 class _Sensor:
@@ -151,12 +140,19 @@ class _Sensor:
         after = filtered_with(config, self.log, events)
         if after is None:
             return None
-        gain = self.gain(after, self.where if scaled else None)
+        gain = self.gain(after, scaled)
         return Mistake(name, *told(after), config, turned, gain) if gain > LEAST_GAIN else None
 
-    def gain(self, after: Filtered, scaled: Where | None = None) -> float:
-        """Return by how much likelier the log is in a second run; nothing where the readings do not fit in it."""
-        return likelihood_gain(self.as_it_is, after, scaled) if after.mean(self.where) <= FITS else -math.inf
+    def gain(self, after: Filtered, scaled: bool = False) -> float:
+        """Return by how much likelier the log is in a second run; nothing where the readings do not fit in it.
+
+        Readings that are scaled do not count themselves: the filter takes the noise of a control for its own, so that
+        their likelihood does not depend on their size.
+        """
+        if after.mean(self.where) > FITS:
+            return -math.inf
+        but = self.as_it_is.of(self.where) if scaled else None
+        return likelihood_gain(self.as_it_is.fit, after.fit, but)
 
     # ------------------------------------------------------------------ each kind
     def noise(self) -> Mistake | None:
@@ -171,7 +167,7 @@ class _Sensor:
         now, times, config = self.as_it_is, 1.0, self.config
         for _ in range(ROUNDS):
             mine = now.of(self.where)
-            m = int(now.dof[mine].max(initial=1))
+            m = int(now.fit.dof[mine].max(initial=1))
             middle = float(np.median(now.run.history.d2[mine])) / float(chdtri(m, 0.5))
             step = math.sqrt(max(middle if times == 1.0 else now.mean(self.where), 1e-6))
             times *= step
@@ -285,13 +281,10 @@ def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], 
     while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
         of = [_Sensor(now, config, log, events, where) for where in now.tried()]
         trials = track((m for sensor in of for m in sensor.trials()), "sensors of the state, tried", show=progress)
-        tried = sorted((m for m in trials if m is not None), key=lambda m: -m.gain)
-        if not tried:
+        first = first_of(sorted((m for m in trials if m is not None), key=lambda m: -m.gain))
+        if first is None:
             break
-        first, *others = tried
-        alike = "; or: ".join(m.evidence for m in others if m.gain > ALIKE * first.gain)
-        more = f"; the log cannot tell this from: {alike}" if alike else ""
-        found.append(first._replace(evidence=first.evidence + more))
+        found.append(first)
         config, events = dict(first.config), [*map(first.change, events)] if first.change else events
         now = filtered_with(config, log, events)
     return found, now

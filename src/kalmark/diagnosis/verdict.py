@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import pdtrc
 
 from kalmark.arrays import Array, Flags, Index
@@ -15,24 +16,28 @@ from kalmark.batch.batch_state import LANDMARKS, POSES
 from kalmark.diagnosis import doubled_landmarks, repeated_events
 from kalmark.diagnosis.batch_search import MORE, WORST, Searched, misfits, search_causes
 from kalmark.diagnosis.blind import blind
-from kalmark.diagnosis.cause_search import LEAST_GAIN, Search
+from kalmark.diagnosis.cause_search import LEAST_GAIN, Search, joined
 from kalmark.diagnosis.cause_texts import finding_text, odd_control_text
-from kalmark.diagnosis.causes import JUMPS, Finding
-from kalmark.diagnosis.gross_mistakes import FITS, LOST, MOVED, fit_of_run, gross, started_at
-from kalmark.diagnosis.gross_mistakes import MISFIT as MISFITS_ALL
-from kalmark.diagnosis.gross_mistakes import MOST as MOST_D2
+from kalmark.diagnosis.causes import JUMPS, TIMES, Finding
+from kalmark.diagnosis.error_columns import ALL
+from kalmark.diagnosis.gross_mistakes import gross, started_at
 from kalmark.diagnosis.jumps import LISTED, Controls, merge_jumps
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.lost import find_lost_robots, unchecked_ends
 from kalmark.diagnosis.mistakes import LATE, Mistake
+from kalmark.diagnosis.single_ids import LEAST as SIGHTINGS
+from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
 from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
+from kalmark.diagnosis.trials import FITS, LOST, filter_events, fit_of_run, likelihood_gain, with_cure
+from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
+from kalmark.diagnosis.trials import MOST as MOST_D2
 from kalmark.diagnosis.turned_mounts import TURNED
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.report import ELSEWHERE as CARRIED
 from kalmark.results.batch import filter_only_sensors, filtered_map
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst_status
-from kalmark.results.control_gaps import KINDS, carried_line, controls_left_out, is_reported, stayed_lost
+from kalmark.results.control_gaps import KINDS, carried_line, controls_left_out, is_reported, stayed_lost, while_lost
 from kalmark.results.figure_texts import count, figure
 from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import RelocatedRobot
@@ -45,7 +50,6 @@ from kalmark.slam.elsewhere import ODDS
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
-from kalmark.tracks.surveys import MISFITS
 
 __all__ = ["Cause", "Effect", "Verdict", "diagnose"]
 
@@ -53,6 +57,7 @@ MOST = 20_000  # observations that a diagnosis takes
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, MOST_OFF = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
+TRIED, ROUNDS = 2, 3  # errors that are tried, and rounds in which the size of one is found
 LIKELY = 0.05  # the probability of so many marks, or more, up to which they are not by chance
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
@@ -61,8 +66,8 @@ SURELY = 50.0  # the score of a systematic error of 10 sigma: what it does to as
 LEAST_S = 5.0  # for which a robot is lost at the end
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped again because of it
 MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
+AGAIN = "the log filtered again without the mistake"  # what a verdict was made of
 JUMP = "odometry_jump"  # the cause of controls that state a motion that did not take place
-MISPLACED = "misplaced_landmark"  # the cause that a landmark is not where its sightings have it
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause of innovations that do not fit, without an explanation
 SEVERITY = dict.fromkeys((*JUMPS, "map_repeats", "lost"), WRONG) | {COPIES: OK}  # the others: doubtful
@@ -151,20 +156,112 @@ def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
 
 
 def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
-    """Return the verdict by what is found in the log: a mistake that explains it, else the causes of what is left."""
+    """Return the verdict by what is found in the log: what explains most is taken out, and the rest is judged so."""
     off, explained = readings_off(run, log, progress)
-    mistake = None if explained else gross(run, log, progress)
-    if mistake is not None and mistake.share > FEW:
-        others = (cause for cause in _structural(run, log, off) if cause.name != MISFIT)
-        return Verdict(WRONG, (_of_mistake(mistake), *others), "the log filtered again without the mistake")
-    verdict = _judged(run, log, off, most, progress)
-    if mistake is None:
+    first = _structural(run, log, off)
+    alarmed = any(not cause.harmless for cause in first)
+    found = None if explained else gross(run, log, alarmed, progress)
+    if found is None:
+        return _with_cure(run, log, _judged(run, log, first, most, progress), alarmed, most, progress)
+    mistake, without = found
+    cause = _of_mistake(mistake)
+    if mistake.name == LATE:
+        late = Finding(
+            LATE, (mistake.cure.split(".")[2].split("=")[0], ALL), mistake.gain, 0.0, mistake.value, unit="s"
+        )
+        return _with_cure(run, log, _judged(run, log, first, most, progress), alarmed, most, progress, late)
+    if without is None:
+        return Verdict(WRONG, (cause, *(c for c in first if c.name in (COPIES, "gap") or c in off)), AGAIN)
+    verdict = _judged(run, log, first, most, progress)
+    cured = _with_cure(run, log, verdict, alarmed, most, progress, least=mistake.gain)
+    others = verdict.search is not None and OUTLIERS not in [c.name for c in verdict.causes]
+    untried = max((f.gain for f in _steady(verdict) if not _own_cure(run, f)), default=0.0)
+    if cured is not verdict or untried > mistake.gain or (mistake.name == OUTLIERS and others):  # it explains more
+        return cured
+    bent, off_m = _bent(run, without)
+    rest = _judged(without, log, _structural(without, log, off), most, progress)
+    shift_m = max(rest.shift_m or 0.0, off_m)
+    return replace(rest, map=worst_status(bent, rest.map), causes=(cause, *rest.causes), shift_m=shift_m)
+
+
+def _with_cure(
+    run: Run, log: Log, verdict: Verdict, alarmed: bool, most: int, progress: bool, *also: Finding,
+    least: float = 0.0,
+) -> Verdict:  # fmt: skip
+    """Return a verdict in which the small errors with which the log is likeliest are taken out by their cures.
+
+    That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
+    """
+    steady = _steady(verdict)
+    doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
+    taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
+    for n in range(ROUNDS if len(run.history.d2) <= MOST and (doubted or also) else 0):
+        tried = [without_error(*at, f) for f in (steady[:1] if n else (*also, *steady[:TRIED]))]
+        gain, without, changed, one = max(tried, key=lambda of: of[0], default=(0.0, *at, None))
+        if one is None or gain < max(LEAST_GAIN, 0.0 if n else least):
+            break
+        have = [taken[key]] if (key := (one.name, *one.of)) in taken else []
+        taken[key] = joined([*have, replace(one, gain=gain)])
+        at = without, changed
+        rest = _judged(*at, _structural(*at, []), most, progress)
+        steady = _steady(rest)
+    if not taken:
         return verdict
-    of_it = (mistake.name, "kidnapped") if mistake.name in (LATE, MOVED) else ()
-    rest = [c for c in verdict.causes if c.name not in of_it]
-    # of late scans nothing is of a landmark in turns: they vanish
-    status = worst_status(verdict.map, DOUBTFUL if of_it else OK)
-    return replace(verdict, map=status, causes=(_of_mistake(mistake), *rest))
+    causes = [_cause(run, f, log) for f in sorted(taken.values(), key=lambda f: -f.gain)]
+    left = [c for c in rest.causes if c.name not in [f.name for f in taken.values()]]
+    before = [c for c in left if c.name == verdict.causes[0].name and not c.harmless][:1]  # is not explained
+    after = (c for c in left if c not in before)
+    status = worst_status(verdict.map, _bent(run, at[0])[0])
+    return replace(verdict, map=status, causes=(*before, *causes, *after))
+
+
+def _steady(verdict: Verdict) -> list[Finding]:
+    """Return the systematic errors and larger noise that a search found, the one that explains most first."""
+    found = verdict.search.found if verdict.search else ()
+    steady = (f for f in found if f.at is None and (f.Z is not None or (f.unit == TIMES and not f.overstated)))
+    return sorted(steady, key=lambda f: -f.gain)
+
+
+def _own_cure(run: Run, finding: Finding) -> str:
+    """Return the line that cures a finding, without those of others that explain as much."""
+    return finding_text(replace(finding, alike=()), run.config)[1]
+
+
+def without_error(run: Run, log: Log, finding: Finding) -> tuple[float, Run, Log, Finding]:
+    """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that."""
+    made = with_cure(run.config, log, _own_cure(run, finding))
+    after = None if made is None else filter_events(*made)
+    if made is None or after is None:
+        return 0.0, run, log, finding
+    return likelihood_gain(fit_of_run(run), fit_of_run(after)), after, made[1], finding
+
+
+def _bent(run: Run, without: Run) -> tuple[str, float]:
+    """Return the status of a map by its shape in a run without a cause, and by what it is off, m.
+
+    Landmarks without ids are compared with those next to them: two of which one is left were one thing.
+    """
+    (mine, sigmas), (places, _) = (r.landmarks.positions() for r in (run, without))
+    names = [[str(i) for i in r.landmarks.ids] for r in (run, without)]
+    if len(places) < NEEDED or len(mine) < NEEDED:
+        return WRONG, math.inf
+    if (run.history.id == "").any():
+        if len(run.history.poses) == len(without.history.poses):
+            known = ~(while_lost(run.history) | while_lost(without.history))
+            mine = rigid(*(r.history.poses[known, : run.history.d] for r in (run, without)))(mine)
+        at = cKDTree(np.nan_to_num(places)).query(np.nan_to_num(mine))[1]
+    else:
+        at = np.array([names[1].index(name) if name in names[1] else -1 for name in names[0]])
+    both = np.isfinite(mine).all(axis=1) & np.isfinite(places[at]).all(axis=1) & (at >= 0)
+    if both.sum() < NEEDED:
+        return WRONG, math.inf
+    twice, lacking = len(at) - len(np.unique(at)), len(places) - len(np.unique(at[both]))
+    mine, places = mine[both], places[at[both]]
+    off, sigma = np.linalg.norm(rigid(mine, places)(mine) - places, axis=1), _sigma(sigmas[both])
+    off_m, extent_m = math.sqrt(float(np.mean(off**2))), rmse(places - places.mean(axis=0))
+    wrong = twice + lacking + int(((off > SIGMAS * sigma) & (off > LEAST * extent_m)).sum())
+    status = _status(off_m, extent_m, float(np.median(sigma)))
+    return worst_status(status, DOUBTFUL if wrong > FEW * len(at) else OK), off_m
 
 
 def _with_signs(run: Run, verdict: Verdict) -> Verdict:
@@ -201,9 +298,9 @@ def status_of(causes: Iterable[Cause]) -> str:
     return worst_status(*(SEVERITY.get(cause.name, DOUBTFUL) for cause in causes if not cause.harmless))
 
 
-def _judged(run: Run, log: Log, off: list[Cause], most: int, progress: bool) -> Verdict:
+def _judged(run: Run, log: Log, first: list[Cause], most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    first, limit = _structural(run, log, off), max(MOST, MORE * most)
+    limit = max(MOST, MORE * most)
     if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
         most = max(most, MOST)  # its reason may show in all of the log only
     try:
@@ -222,43 +319,21 @@ def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdic
     effect = effect_of(run, found)
     moved = [f for f in found.search.found if is_misplaced_survey(run, f)]
     status = worst_status(effect.status, status_of(first), DOUBTFUL if moved else OK)
-    causes = _ordered(run, first, found, _found(run, log, first, found, effect))
+    causes = [*first, *(c for c in _found(run, log, first, found, effect) if c not in first)]
+    causes.sort(key=lambda c: c.harmless)
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
     return Verdict(status, tuple(causes), checked, *figures, effect.robots, found.search)
 
 
 def _found(run: Run, log: Log, first: list[Cause], found: Searched, effect: Effect) -> list[Cause]:
-    """Return the causes that a search found, and the controls that jump: these go first where it was robust.
-
-    A robust solution rather leaves out what is after them; between segments it is not looked for jumps.
-    """
+    """Return the causes that a search found, and controls that jump: between segments it looks for no jumps."""
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
-    odd = [*odd_controls(run, log)] if found.pulled else []
-    if odd:
-        causes = [cause for cause in causes if cause.name not in JUMPS]
-    elif found.given.segments is not None and not any(cause.name in JUMPS for cause in causes):
+    if found.given.segments is not None and not any(cause.name in JUMPS for cause in causes):
         causes += odd_controls(run, log)
     if not any(cause.name == COPIES for cause in first):  # then the filter is too sure for that
         causes += _too_sure(run, effect)
-    return [*odd, *sorted(causes, key=lambda cause: -cause.score)]
-
-
-def _ordered(run: Run, first: list[Cause], found: Searched, causes: list[Cause]) -> list[Cause]:
-    """Return the causes that a search cannot show and those that it found, each after what may be why.
-
-    Systematic errors double maps and carry robots away, a noise that is stated too small splits landmarks.
-    """
-    if not any(c.name == "gap" and not c.harmless for c in first):  # else it is that what doubles maps
-        steady = {f.name for f in found.search.found if f.Z is not None and f.at is None}
-        alone = [c.score for c in first if c.name == "kidnapped" and not run.summary.get("repeats")]
-        before = [c for c in causes if c.name in steady and c.score > min([SURELY, *alone])]
-        first = [*before, *(_as_well(c, before) for c in first)]
-    split = [c for c in first if c.name == "split_landmarks"]
-    noisy = [c for c in causes if split and c.name.endswith("_sigma") and c.score > SURELY and c not in first]
-    if noisy:
-        first = [*(c for c in first if c not in split), *noisy, *split]
-    return sorted([*first, *(c for c in causes if c not in first)], key=lambda c: c.harmless)
+    return sorted(causes, key=lambda cause: -cause.score)
 
 
 def _all_misfit(run: Run) -> Iterator[str]:
@@ -269,13 +344,6 @@ def _all_misfit(run: Run) -> Iterator[str]:
     mean = fit_of_run(run).mean
     if MISFITS_ALL < mean < np.inf:
         yield f"d2 per degree of freedom is {figure(mean, 2)} over all observations, where 1 is expected"
-
-
-def _as_well(cause: Cause, before: Sequence[Cause]) -> Cause:
-    """Return that a robot was carried away with what explains it, too, if that is known: it is to be cured first."""
-    if cause.name != "kidnapped" or not before:
-        return cause
-    return replace(cause, evidence=f"{cause.evidence}, which {before[0].name} may do, too", cure="")
 
 
 def begin_s(run: Run) -> float:
@@ -354,6 +422,8 @@ def is_misplaced_survey(run: Run, finding: Finding) -> bool:
 
 def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
     """Return the causes that residuals cannot show: a place that is mapped twice still fits its data."""
+    if not run.summary:
+        run.evaluate()
     return [
         *find_kidnaps(run, log),
         *gaps(run),
@@ -361,7 +431,6 @@ def _structural(run: Run, log: Log, off: list[Cause]) -> list[Cause]:
         *cause_of_repeats(run.summary),
         *split_landmarks(run),
         *unseen_landmarks(run),
-        *misplaced_landmarks(run),
         *_remapped_landmarks(run),
         *fits_nothing(run),
         *off,
@@ -428,43 +497,19 @@ def _left_out_until(run: Run, placed: Sequence[RelocatedRobot]) -> float:
     return score
 
 
-def misplaced_landmarks(run: Run) -> list[Cause]:
-    """Return the landmarks, known by their ids, of which the gate leaves out more sightings than it passes.
-
-    What is left out is in no batch solution.  Surveys have a cause of their own.
-    """
-    h, now = run.history, fit_of_run(run)
-    surveyed, mapped = {prior.landmark for prior in h.priors}, {str(id_) for id_ in run.landmarks.ids}
-    with_id, out, used = h.id != "", h.outcome == "rejected", h.outcome == "associated"
-    rows: list[int] = []
-    names: list[str] = []
-    for name in np.unique(h.landmark[with_id & out]).tolist():
-        mine = with_id & (h.landmark == name)
-        left = np.flatnonzero(mine & out)
-        if name in mapped - surveyed and len(left) >= MISFITS and len(left) > (mine & used).sum():
-            rows, names = [*rows, *left.tolist()], [*names, name]
-    if not names:
-        return []
-    score, since_s = 0.5 * float(now.values[rows] @ now.dof[rows]), float(h.t_ns[h.step[rows]].min()) * 1e-9
-    some = ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
-    some = f"{count(len(names), 'landmark')} of {len(mapped)} ({some}) not where the map says"
-    more = f"{len(rows)} sightings are outside the gate, more than within"
-    evidence = f"{some}: {more}. An outlier at first sight, or an id that means another place"
-    cure = "leave out their first sightings, or use robust: huber instead of a gate"
-    few = len(names) <= FEW * len(mapped) or len(rows) <= FEW * len(h.id)
-    return [Cause(MISPLACED, since_s, score, evidence, cure, few)]
-
-
 def _remapped_landmarks(run: Run) -> Iterator[Cause]:
-    """Yield the landmarks whose first sightings the filter found to be outliers, which does no harm."""
+    """Yield the landmarks that were begun again elsewhere: moved, or begun by an outlier.  It does no harm."""
     h = run.history
     for change in (c for c in h.changes if c.reason == BEGUN_AGAIN):
-        rows = np.flatnonzero((h.id == change.landmark) & (h.outcome == "new"))
-        since_s = float(h.t_ns[h.step[rows[0]] if len(rows) else change.step]) * 1e-9
-        evidence = f"landmark {change.landmark} was begun by an outlier: from later sightings it was begun again"
-        yield Cause(
-            MISPLACED, since_s, 0.5 * MOST_D2, evidence, f"leave out its first sighting, at t={since_s:.1f} s", True
-        )
+        rows = np.flatnonzero((h.id == change.landmark) & (h.step <= change.step))
+        now_s, begun_s = (float(h.t_ns[step]) * 1e-9 for step in (change.step, h.step[rows].min(initial=change.step)))
+        score, cure = 0.5 * MOST_D2 * len(rows), f"leave out its first sighting, at t={begun_s:.1f} s"
+        if (h.outcome[rows] != "rejected").sum() >= SIGHTINGS:
+            told = f"landmark {change.landmark} was moved by t={now_s:.1f} s: from then on it is mapped there"
+            yield Cause(MOVED, now_s, score, told, "", True)
+            continue
+        told = f"landmark {change.landmark} was begun by an outlier: from later sightings it was begun again"
+        yield Cause(MISPLACED, begun_s, score, told, cure, True)
 
 
 def fits_nothing(run: Run) -> Iterator[Cause]:
@@ -491,7 +536,7 @@ def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]
     left = {*after.off()} if found and after is not None else {*now.off()}
     for robot, sensor in (of for of in now.off() if of in left):
         mine = now.of((robot, sensor))
-        dof, mean = int(now.dof[mine].sum()), now.mean((robot, sensor))
+        dof, mean = int(now.fit.dof[mine].sum()), now.mean((robot, sensor))
         score, of = 0.5 * dof * (mean - 1.0 - float(np.log(mean))), f"{len(mine)} readings of {sensor} of {robot}"
         evidence = f"d2 per degree of freedom is {figure(mean, 2)} over {of}, where 1 is expected"
         cure = "state more noise for it, or look for what lasts: a bias, a delay, its mount, a wrong start"
@@ -704,12 +749,10 @@ def effect_of(run: Run, found: Searched) -> Effect:
     places, moved = (state.groups[LANDMARKS][its, :d] for state in (found.batch.state, cured.moved()))
     steady = replace(first, z=cured.z, w=cured.w).moved().groups[LANDMARKS][its, :d]  # the noise as it was stated
     mapped = filtered_map(run)
-    if found.pulled:  # the filter's map is off otherwise
-        places = np.array([mapped[run.landmarks.ids[k]][0][:d] for k in mine])
     lines = np.array([run.landmarks.kinds[k] == "wall" for k in mine])
     angle = np.where(lines, found.batch.state.groups[LANDMARKS][its, -1], np.nan)
     onto, extent = rigid(places, moved), rmse(moved - moved.mean(axis=0))
-    robots = dict(_paths(run, found, onto, extent)) if len(rows) > d and not found.pulled else {}
+    robots = dict(_paths(run, found, onto, extent)) if len(rows) > d else {}
     off = _off(onto, places, moved, angle)
     by_steady = rmse(_off(rigid(places, steady), places, steady, angle))
     P = np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine])

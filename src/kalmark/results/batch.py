@@ -34,6 +34,7 @@ from kalmark.results.landmark_table import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
 from kalmark.results.restarts import Restart, restarts
 from kalmark.slam.surveyed_corrections import ELSEWHERE
+from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 
 MOST_REJECTED = 0.2  # of the fixes
 STRETCHES = 10  # of a robot's path, each with its difference from the batch solution
@@ -143,6 +144,8 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
     placed = history.fused
     for gap in history.carried():  # by a robot that was elsewhere than the filter had it
         placed &= ~history.while_carried(gap)[history.step]
+    for change in (c for c in history.changes if c.reason == BEGUN_AGAIN):
+        placed &= (history.landmark != change.landmark) | (history.step > change.step)
     fused = np.flatnonzero(placed)
     rows = _of_places(history, slam, fused if rows is None else rows)
     fused = _of_places(history, slam, fused)

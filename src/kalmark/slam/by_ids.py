@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from typing import cast
 
-import numpy as np
-
 from kalmark.events import Id, Scan
 from kalmark.filter.estimators import Update
 from kalmark.report import JudgedScan, Report
@@ -50,7 +48,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
         track.observations += used
     if policy.contests and not fused.all():
         group = JudgedScan(range(len(ids)), ids, ids, done, channel.gate)
-        tentative.contest(state, scan, model, group, ~fused & ~np.isnan(done.d2), policy.upkeep.odds)
+        tentative.contest(state, scan, model, group, elsewhere.misfits(state, scan, done), policy.upkeep.odds)
     if report.gaps and fused.any():
         moving.held.located(event.t_ns)
     report.judged = (JudgedScan(range(len(ids)), ids, ids, done, channel.gate),)

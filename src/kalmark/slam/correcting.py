@@ -57,8 +57,12 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         )
         report.fill(rows, done)
         judged.append(JudgedScan(rows, scan.ids, names, done, min(scan.channel.gate, least)))
-        if policy.contests:
-            misfits = _misfits(scan, model, slots, rows, update, done)
+        if policy.contests and scan.event.ids is not None:
+            misfits = (
+                elsewhere.misfits(state, scan, done)
+                if scan.channel.robust is None
+                else _outliers(scan, model, slots, rows, update, done)
+            )
             tentative.contest(state, scan, model, judged[-1], misfits, policy.upkeep.odds)
         state.tracks.count(names, done.fused.tolist())
     return judged, found + _average(state, scan, decisions) if policy.averages else found
@@ -90,12 +94,10 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
     return judged
 
 
-def _misfits(
+def _outliers(
     scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int], update: Update, done: Correction
 ) -> Flags:  # fmt: skip
-    """Return which observations (K,) do not fit: beyond the gate or, where outliers count less, by their own noise."""
-    if scan.channel.robust is None:
-        return np.asarray(~done.fused & ~np.isnan(done.d2))
+    """Return which observations (K,) do not fit by their own noise, where outliers count less."""
     Z = done.Z - update.R + scan.noise(model, slots, rows)
     regular: Flags = np.asarray(np.isfinite(Z).all(axis=(1, 2)), dtype=np.bool_)
     z, Z = np.where(regular[:, None], done.z, 0.0), np.where(regular[:, None, None], Z, np.eye(Z.shape[1]))

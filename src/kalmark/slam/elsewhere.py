@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Flags
 from kalmark.association.global_start import LOOSE, SURE, Proposal, locate_points, locate_rays, locate_tags, rows_of
 from kalmark.association.relocalization import is_same_pose
 from kalmark.events import Id
@@ -64,13 +64,19 @@ def limit_of(state: State, scan: ScanContext) -> float:
     return WIDER**2 * gate(SURVEYED, scan.channel.dof)
 
 
+def misfits(state: State, scan: ScanContext, done: Correction) -> Flags:
+    """Return which observations (K,) are left out, by a gate that is set or as far off."""
+    most = min(state.policies[scan.key].association.threshold(scan.channel.dof, math.inf), limit_of(state, scan))
+    return np.asarray(~done.fused & (done.d2 > most))
+
+
 def correct(
     state: State, scan: ScanContext, names: Sequence[Any], update: Update, estimator: Estimator | None = None
 ) -> Correction:
     """Correct the map; observations with ids beyond `limit_of`, or of what cannot be seen from here, are far off.
 
-    These are held back while no landmark as old fits.  If one does, and after `HELD` scans of several that lead to no
-    pose, they are used where their gate lets them.
+    These are left out while landmarks as old fit, and held back while none does.  After `HELD` scans of several that
+    lead to no pose they are used where their gate lets them.
     """
     limit = limit_of(state, scan)
     if limit == math.inf:
@@ -86,7 +92,7 @@ def correct(
     of.weigh()
     out = [k for k in far if done.d2[k] <= update.gate]
     of.held += len(of.missed) >= SEVERAL and not of.fitted
-    if (of.ratio < 0.0 and of.held <= HELD) or not out:
+    if of.ratio >= 0.0 or of.held <= HELD or not out:
         return done
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
     fused = done.fused.copy()

@@ -88,7 +88,7 @@ def policy_of(
         0.0 if channel.joins else linear or 0.0,
         upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
         not channel.finds_depth and channel.mount >= 0 and any(isinstance(kind, AnchoredHomogeneous) for kind in seen),
-        (channel.robust is not None or association.threshold(channel.dof, math.inf) < math.inf)
+        (channel.robust is not None or association.threshold(channel.dof, 0.0) < math.inf)
         and delayed is None and (deferred is None or channel.is_ambiguous) and channel.starts_landmarks,
         type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
         and not (reviews or varies or looks_back or approaches),

@@ -1,0 +1,209 @@
+"""Trials: a log filtered again as if something were not wrong with it, and how much likelier the same observations are.
+
+What a change leaves unused counts as an observation at the cap, as it does without the change: no change is better for
+what it leaves out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.config import build_slam
+from kalmark.config.reading import config_of
+from kalmark.config.tree import Tree, parse_value
+from kalmark.diagnosis.mistakes import Mistake, configured_value, with_value
+from kalmark.errors import KalmarkError, LogError
+from kalmark.events import Event, Scan, sort_key
+from kalmark.logs.log import Log
+from kalmark.logs.log_corrections import correct_log
+from kalmark.report import ALONE
+from kalmark.results.control_gaps import while_lost
+from kalmark.results.history import History, Ints
+from kalmark.results.record import record
+from kalmark.results.run import Run
+from kalmark.results.warnings import left_out_by_attention
+from kalmark.slam.held_readings import AGAIN
+
+SCANS, OBSERVATIONS, EVENTS = 400, 3000, 10_000  # of the log are filtered again, whatever comes first
+DETECTED = 7  # observations in a raw scan, or so
+FEW_SKIPPED = 0.02  # of the events may be refused in a log that fits
+MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
+FITS = 2.0  # below which a log fits
+LOST = 9.0  # what an observation without an id counts that is of no landmark in the map: as one at the gate
+MOST = 25.0  # that one observation counts, and what counts one that was left out
+ALIKE = 0.95  # of the gain of the likeliest change: the log does not distinguish them
+SURELY = 50.0  # the gain of what is 10 sigma off
+TINY = 1e-300
+LOG_PEAK = 0.5 * math.log(2.0 * math.pi)  # of a Gaussian of variance 1
+
+
+class Fit(NamedTuple):
+    """Fit of observations (O,): d2 per degree of freedom, at most `MOST`, the degrees of freedom, log-likelihoods.
+
+    The likelihood of an observation is that of its innovation over that at the peak of the noise that is stated.
+    """
+
+    values: Array
+    dof: Array
+    likelihoods: Array
+
+    @property
+    def mean(self) -> float:
+        """Its mean over the observations; that of a log that the filter refuses, or that has none, is infinite."""
+        return float(self.values.mean()) if len(self.values) else math.inf
+
+    @property
+    def chi2(self) -> float:
+        """The sum of the d2."""
+        return float(self.values @ self.dof)
+
+    def of(self, rows: slice) -> Fit:
+        """Return that of some observations."""
+        return Fit(*(part[rows] for part in self))
+
+
+REFUSED = Fit(np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+def fit_of_run(run: Run, shrunk: Mapping[tuple[str, str], float] | None = None) -> Fit:
+    """Return the fit of the observations of a run: one without a landmark counts `MOST`.
+
+    What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
+    time, and clutter fits none either.  What is deferred after a gap, until the robot is known again, contradicts
+    nothing, nor does what is of a landmark that no sensor has started, what was given before, or what an attention
+    leaves out.  `shrunk` has by how much the logarithm of what a sensor measures is smaller than in the log:
+    so much smaller is its density there.
+    """
+    history = run.history
+    known = np.isfinite(history.z)
+    dof = np.maximum(known.sum(axis=1), 1)
+    d2 = np.minimum(np.nan_to_num(history.d2, nan=0.0) / dof, MOST)
+    d2 = np.where(np.isin(history.outcome, ("rejected", "ignored")), MOST, d2)
+    d2 = np.where((history.id == "") & (history.outcome != "associated"), LOST, d2)
+    early = (np.char.find(history.reason, ALONE) >= 0) | left_out_by_attention(history)
+    early |= (history.outcome == "deferred") & while_lost(history)[history.step]
+    early |= history.reason == AGAIN
+    values = np.where(early, 1.0, d2)
+    return Fit(values, dof, np.where(early, 0.0, _likelihoods(history, dof, shrunk or {})))
+
+
+def _likelihoods(h: History, dof: Ints, shrunk: Mapping[tuple[str, str], float]) -> Array:
+    """Return the log-likelihoods (O,) of observations, but for a constant.
+
+    One that is of nothing in the map, or is left out, may be anywhere among what its sensor measures; so may any other.
+    """
+    stated = np.isfinite(h.noise).sum(axis=1)
+    judged = np.isfinite(h.d2) & ((h.outcome == "associated") | h.of_own) & ((stated == 0) | (stated == dof))
+    robots, fits, anywhere = h.robot[h.step], np.where(judged, -0.5 * h.d2, -np.inf), -0.5 * MOST * dof
+    for robot, sensor, m in sorted({*zip(robots.tolist(), h.sensor.tolist(), stated.tolist(), strict=True)}):
+        rows = np.flatnonzero((robots == robot) & (h.sensor == sensor) & (stated == m))
+        by, sigma = shrunk.get((robot, sensor), 0.0), np.log(np.maximum(h.noise[rows, :m], TINY))
+        if m and h.y.shape[1] >= m:
+            span = np.log(np.maximum(np.ptp(np.nan_to_num(h.y[rows, :m]), axis=0), TINY)) - LOG_PEAK
+            anywhere[rows] = -np.maximum(span, sigma + 1.0).sum(axis=1) - by
+            rows = rows[judged[rows]]
+            fits[rows] -= 0.5 * np.linalg.slogdet(h.Z[rows][:, :m, :m])[1] + by
+    return np.maximum(fits, anywhere)
+
+
+class Trials:
+    """Events of a log under a configuration, filtered as they are and with changes, each once."""
+
+    def __init__(self, log: Log, events: list[Event], config: Mapping[str, Any]) -> None:
+        self.log, self.events, self.config = log, events, config
+        self.as_it_is = self.with_change(Mistake("", "", "", config))
+
+    def with_change(self, change: Mistake) -> Fit:
+        """Return the fit of the events with a change."""
+        events = sorted(map(change.change, self.events), key=sort_key) if change.change else self.events
+        run = filter_events(change.config, self.log, events)
+        return REFUSED if run is None else fit_of_run(run, change.shrunk)
+
+    def explain(self, change: Mistake) -> Iterator[Mistake]:
+        """Yield a change with its gain, if the events are surely likelier with it, whatever their noise."""
+        after = self.with_change(change)
+        gain = likelihood_gain(self.as_it_is, after)
+        if gain > SURELY * max(after.mean, 1.0):
+            yield change._replace(gain=gain, since_s=self.events[0].t_s)
+
+
+def first_of(made: Sequence[Mistake]) -> Mistake | None:
+    """Return the change that explains most, the first of several; the others are said with it."""
+    if not made:
+        return None
+    most = max(one.gain for one in made)
+    first, *others = (one for one in made if one.gain >= ALIKE * most)
+    alike = "; or: ".join(one.evidence for one in others)
+    return first._replace(evidence=f"{first.evidence}; the log cannot tell this from: {alike}") if alike else first
+
+
+def likelihood_gain(before: Fit, after: Fit, but: Ints | None = None) -> float:
+    """Return the logarithm of the likelihood ratio of the same observations, `but` of some.
+
+    Those that are missing count `MOST`.
+    """
+    first, second = (one.likelihoods if but is None else np.delete(one.likelihoods, but) for one in (before, after))
+    return float(second.sum() - first.sum()) - 0.5 * MOST * (len(first) - len(second))
+
+
+def first_events(run: Run, events: Iterable[Event], most: int = SCANS) -> list[Event]:
+    """Return the first events, with so many scans and observations; in a raw scan are few, however many its beams."""
+    robots = run.final_slam().robots.values()
+    detected = {(r.name, name) for r in robots for name, m in r.sensors.items() if m.detector is not None}
+    found, scans, observations = list[Event](), 0, 0
+    for n, event in enumerate(events):
+        found.append(event)
+        if isinstance(event, Scan):
+            number = DETECTED if (event.robot, event.sensor) in detected else len(event.y)
+            scans, observations = scans + 1, observations + number
+            if scans >= most or observations >= OBSERVATIONS or n >= EVENTS:
+                break
+    return found
+
+
+def with_cure(config: Mapping[str, Any], log: Log, cure: str) -> tuple[dict[str, Any], Log, list[Event]] | None:
+    """Return a configuration, its log and the events of that with the lines of a cure; None if that is in words.
+
+    None, too, if the log has nothing that a line names.
+    """
+    lines = cure.split("--set ")
+    changed, read = dict(config), log
+    if len(lines) < 2 or lines[0].strip():
+        return None
+    for line in lines[1:]:
+        path, _, text = line.strip().strip("'").partition("=")
+        names, value = tuple(path.split(".")), parse_value(text, "cure")
+        if names[0] == "log":
+            is_factor, now = names[1] == "factors", configured_value(config, names)
+            by = _nested(names[2:], value / (now or 1.0) if is_factor else value - (now or 0.0))
+            try:
+                read = correct_log(read, *((by, None) if is_factor else (None, by)))
+            except LogError:
+                return None
+        else:
+            if names[0] == "robots" and names[1] not in changed["robots"]:
+                changed = with_value(changed, names[:2], changed["robots"]["each"])
+            changed = with_value(changed, names, value)
+    return changed, read, list(read.events)
+
+
+def _nested(names: Sequence[str], value: float) -> dict[str, Any]:
+    return {names[0]: _nested(names[1:], value) if len(names) > 1 else value}
+
+
+def filter_events(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
+    """Return the run of events under a configuration, None if they are refused."""
+    try:
+        made = config_of(Tree(deepcopy(dict(config))), None)
+        part = replace(log, events=events)
+        run = record(build_slam(made, part), part, progress=False, on_error="skip", pictures=False)
+    except (KalmarkError, np.linalg.LinAlgError):
+        return None
+    return None if run.stopped or len(run.skipped) > FEW_SKIPPED * len(events) else run
