@@ -160,6 +160,6 @@ def test_a_change_of_scale_moves_the_inverse_distance_along_its_hyperbola() -> N
     map_.P[:13, :13] = np.tril(np.outer(scale, scale)) * 0.3**2 + 1e-9 * np.eye(13)
     antenna = np.array([0.0, 0, 0, 0, 0, 0, 1])
     scan = 0, -1, np.array([], dtype=np.int64), 0, np.array([[2.6, 0, 0]]), 1e-6 * np.eye(3)[None]
-    km.estimators.Invariant(30, 1e-9).correct(map_, Update(km.models.observe.fix_view(antenna), *scan))
+    km.estimators.Invariant(30, 1e-9).correct(map_, Update(view_of(km.sensors.Gps3D(), None, antenna), *scan))
     assert map_.x[0] == pytest.approx(2.6, abs=1e-3)
     assert map_.x[13] == pytest.approx(0.2 / 1.3, abs=2e-3), "a plain correction would make it 0.14"

@@ -13,7 +13,7 @@ from kalmark.errors import ModelError
 from kalmark.geometry import wrap
 from kalmark.geometry.frames import compose
 from kalmark.geometry.gaussian import gate
-from kalmark.models.observe import expectation, inverse_expectation, linearize, linearize_in_plane, view_of
+from kalmark.models.observe import expectation, inverse_expectation, linearize, linearize_chain, view_of
 from kalmark.models.pointwise import jacobian
 
 DEG = np.pi / 180
@@ -42,7 +42,7 @@ def test_an_inverse_depth_of_the_plane_has_the_jacobians_of_its_differences() ->
         close(E_s[0], jacobian(lambda x: expectation(r, x, EYE, INVERSE, l)[0][0], mount, (True,)))
         close(E_l[0], jacobian(lambda x: expectation(r, mount, EYE, INVERSE, x[None])[0][0], l[0], (True,)))
         view = view_of(EYE, INVERSE, mount)
-        for one, other in zip(linearize(view, r, l, e + 0.1), linearize_in_plane(view, r, l, e + 0.1), strict=True):
+        for one, other in zip(linearize(view, r, l, e + 0.1), linearize_chain(view, r, l, e + 0.1), strict=True):
             np.testing.assert_array_equal(one, other)
         y = rng.uniform(-3, 3, (1, 1))
         _, L_r, L_s, L_y, _ = inverse_expectation(r, mount, EYE, INVERSE, y)

@@ -10,7 +10,7 @@ import pytest
 
 import kalmark as km
 from kalmark.errors import ModelError
-from kalmark.models.observe import PythonView, linearize, linearize_in_plane, sensor_address, sensor_at, view_of
+from kalmark.models.observe import PythonView, linearize, linearize_chain, sensor_address, sensor_at, view_of
 from kalmark.models.pointwise import jacobian
 from kalmark.results.filter_description import calibrated_mounts
 from kalmark.results.self_calibration import mount_figures
@@ -42,9 +42,9 @@ def test_scale_and_bias_have_the_jacobians_of_differences_compiled_and_in_python
         np.testing.assert_allclose(E_h[0], numeric, rtol=1e-6, atol=1e-6 * (1 + np.abs(numeric).max()))
         for one, other in zip(plain.linearize(head, l, y), (e, z, E_h, E_l), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-12)
-        for one, other in zip(linearize_in_plane.py_func(compiled, head, l, y), (e, z, E_h, E_l), strict=True):
+        for one, other in zip(linearize_chain.py_func(compiled, head, l, y), (e, z, E_h, E_l), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-12)
-        assert sensor_at(compiled, head, sensor_address(1))[1].shape == (2, 8)
+        assert sensor_at(compiled, head, sensor_address())[1].shape == (2, 8)
 
 
 @pytest.mark.parametrize("sensor", [km.sensors.RangeBearing, km.sensors.RangeBearingSignature])

@@ -11,11 +11,9 @@ import pytest
 import kalmark as km
 from kalmark.errors import EventError, MapError, ModelError
 from kalmark.geometry.spaces import SE2, SE3
-from kalmark.models.known_view import known_view
 from kalmark.models.model_check import check_model
-from kalmark.models.observe import linearize, sensor_address, sensor_at
+from kalmark.models.observe import PythonView, linearize, sensor_address, sensor_at, view_of
 from kalmark.models.protocols import tells_velocity
-from kalmark.models.velocity_view import PythonMovingView, moving_view_of
 
 SENSORS: list[Any] = [km.sensors.RangeRate2D(), km.sensors.RangeRate3D(), km.sensors.Radar2D(), km.sensors.Radar3D()]
 COASTING: list[Any] = [km.motion.ConstantVelocity(), km.motion.ConstantTurnRate(), km.motion.ConstantVelocity3D()]
@@ -41,8 +39,8 @@ def test_jacobians_in_pose_state_and_landmark_are_those_of_differences(sensor: A
     rng, plane = np.random.default_rng(1), sensor.world == "plane"
     pose, landmark = (SE2, km.landmarks.Point2D()) if plane else (SE3, km.landmarks.Point3D())
     at, angular = drawn(pose, rng), np.array(sensor.angular)
-    of = sensor, landmark, motion, at, SINCE
-    view, in_python = moving_view_of(*of), PythonMovingView(*of, angular)
+    view = view_of(sensor, landmark, at, motion, SINCE)
+    in_python = PythonView(sensor, landmark, at, angular, motion, SINCE)
     behind = motion.space if tells_velocity(motion) else pose
     for _ in range(5):
         r, x = drawn(pose, rng), drawn(behind, rng)
@@ -67,9 +65,7 @@ def test_jacobians_in_pose_state_and_landmark_are_those_of_differences(sensor: A
             up, down = seen(r, x, l + d), seen(r, x, l - d)
             rise = np.where(angular, np.sin(up - down), up - down) / 2e-6
             np.testing.assert_allclose(E_l[:, :, j], rise, atol=1e-6)
-        e_known, _, E_known, none = linearize(
-            known_view(view), np.concatenate([r, x]), np.zeros((3, 0)), np.hstack([y, l])
-        )
+        e_known, _, E_known, none = linearize(view, np.concatenate([r, x]), np.zeros((3, 0)), np.hstack([y, l]))
         np.testing.assert_array_equal(e_known, np.hstack([e, l]))
         np.testing.assert_array_equal(E_known, E_h)
         assert none.shape == (3, len(sensor.angular), 0)
@@ -81,9 +77,7 @@ def test_the_place_of_a_sensor_depends_on_the_pose_alone(motion: Any) -> None:
     pose = SE2 if plane else SE3
     sensor, landmark = (SENSORS[2], km.landmarks.Point2D()) if plane else (SENSORS[3], km.landmarks.Point3D())
     at, r, x = drawn(pose, rng), drawn(pose, rng), drawn(motion.space, rng)
-    S, S_h = sensor_at(
-        moving_view_of(sensor, landmark, motion, at, SINCE), np.concatenate([r, x]), sensor_address(motion.space.axes)
-    )
+    S, S_h = sensor_at(view_of(sensor, landmark, at, motion, SINCE), np.concatenate([r, x]), sensor_address())
     from kalmark.models.observe import sensor_pose
 
     np.testing.assert_allclose(S, sensor_pose(r, at)[0][: len(S)], atol=1e-14)
@@ -94,7 +88,7 @@ def test_the_place_of_a_sensor_depends_on_the_pose_alone(motion: Any) -> None:
 def test_a_rate_is_how_fast_the_range_changes() -> None:
     motion, at = km.motion.ConstantVelocity(), np.array([0.7, -0.4, 0.5])
     state, landmark = np.array([1.0, 2.0, 0.3, 1.5, -0.4, 0.6]), np.array([[8.0, 5.0]])
-    radar = moving_view_of(km.sensors.Radar2D(), km.landmarks.Point2D(), motion, at, SINCE)
+    radar = view_of(km.sensors.Radar2D(), km.landmarks.Point2D(), at, motion, SINCE)
 
     def seen(x: Any) -> Any:
         return linearize(radar, np.concatenate([x[:3], x]), landmark, np.zeros((1, 3)))[0][0]
@@ -119,7 +113,7 @@ def test_rates_of_surveyed_landmarks_tell_the_velocity() -> None:
         for name, place in buoys.items():
             slam.add_landmark(name, place, None if name % 2 else 1e-6 * np.eye(2))
         for name, mount in mounts.items():
-            view = moving_view_of(sensor, km.landmarks.Point2D(), motion, np.array(mount.at), SINCE)
+            view = view_of(sensor, km.landmarks.Point2D(), np.array(mount.at), motion, SINCE)
             e = linearize(view, np.concatenate([truth[:3], truth]), np.array([*buoys.values()]), np.zeros((4, 1)))[0]
             report = slam.process(km.Scan(0.0, "r", name, e + rng.normal(0, 0.05, e.shape), [*buoys]))
             assert all(o.outcome == "associated" for o in report.observations)
@@ -142,7 +136,7 @@ def test_a_radar_starts_landmarks_and_finds_its_velocity(estimator: Any) -> None
     )
     slam, truth = km.Slam(robot, estimator=estimator), np.array([0.0, 0, 0, 1.7, 0.1])
     buoys, view = np.array([[10.0, 3.0], [5.0, -8.0], [-9.0, 4.0]]), None
-    view = moving_view_of(km.sensors.Radar2D(), km.landmarks.Point2D(), motion, np.zeros(3), SINCE)
+    view = view_of(km.sensors.Radar2D(), km.landmarks.Point2D(), np.zeros(3), motion, SINCE)
     for k in range(20):
         e = linearize(view, np.concatenate([truth[:3], truth]), buoys, np.zeros((3, 3)))[0]
         report = slam.process(km.Scan(0.2 * k, "r", "radar", e + rng.normal(0, [0.2, 0.02, 0.1], (3, 3)), [1, 2, 3]))
@@ -161,7 +155,7 @@ def drives(seed: int, steps: int = 60) -> tuple[km.Slam, Any, list[Any]]:
     at, posts, x = np.array([0.5, 0.2, 0.3]), np.array([[10.0, 3.0], [5.0, -8.0], [-9.0, 4.0]]), np.zeros(3)
     radar, since = km.sensors.Radar2D(0.05), np.array([0.2])
     slam = km.Slam(km.Robot("r", motion=motion, sensors={"radar": km.Mount(radar, at=at)}))
-    view, reports = moving_view_of(radar, km.landmarks.Point2D(), motion, at, since), []
+    view, reports = view_of(radar, km.landmarks.Point2D(), at, motion, since), []
     for k in range(steps):
         u = np.array([1.0, 0.2])
         slam.process(km.Control(0.2 * k, "r", u + rng.normal(0, [0.3, 0.05])))
@@ -225,7 +219,7 @@ def test_a_radar_tells_the_depth_of_what_bearings_have_begun() -> None:
     posts = np.array([[10.0, 3.0], [8.0, -6.0], [14.0, 4.0], [12.0, -2.0]])
     motion, radar = km.motion.Unicycle(0.05, 0.02), km.sensors.Radar2D(0.05)
     camera = km.Mount(km.sensors.Bearing(0.01), landmark=km.landmarks.InverseDepth2D())
-    view = moving_view_of(radar, km.landmarks.Point2D(), motion, at, np.array([0.2]))
+    view = view_of(radar, km.landmarks.Point2D(), at, motion, np.array([0.2]))
     for seed in range(12):
         rng, x, outcomes = np.random.default_rng(seed), np.zeros(3), set[str]()
         slam = km.Slam(km.Robot("r", motion=motion, sensors={"camera": camera, "radar": km.Mount(radar, at=at)}))

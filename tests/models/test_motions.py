@@ -12,8 +12,9 @@ import kalmark as km
 from kalmark.compiled import address_of
 from kalmark.filter.prediction import noise_in_world
 from kalmark.geometry.spaces import Rn, Space
-from kalmark.models.observe import VELOCITY, call_velocity, step, step_of
+from kalmark.models.observe import step, step_of
 from kalmark.models.protocols import HasVelocity, coasts, diffusion_of, true_control
+from kalmark.models.state_view import VELOCITY, call_velocity
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 COASTING: list[Any] = [km.motion.ConstantVelocity3D(), km.motion.ConstantVelocity(), km.motion.ConstantTurnRate()]

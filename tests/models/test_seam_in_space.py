@@ -17,7 +17,7 @@ from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import exp
 from kalmark.geometry.spaces import MOUNTS
 from kalmark.models import landmarks
-from kalmark.models.observe import expectation, inverse_expectation, linearize, linearize_in_space, view_of
+from kalmark.models.observe import expectation, inverse_expectation, linearize, linearize_chain, view_of
 from kalmark.tracks.channel import ObservationModel
 from placed_landmarks import placed
 
@@ -116,7 +116,7 @@ def test_the_compiled_models_called_by_address_equal_the_written_out_composition
         ours = linearize(view, head, l, y)
         for mine, written in zip((ours[0], *ours[2:]), (e, np.concatenate([E_r, E_s], axis=2), E_l), strict=True):
             np.testing.assert_allclose(mine, written, rtol=1e-12, atol=1e-12 * (1 + np.abs(written).max()))
-        for mine, plain in zip(ours, linearize_in_space.py_func(view, head, l, y), strict=True):  # type: ignore[attr-defined]
+        for mine, plain in zip(ours, linearize_chain.py_func(view, head, l, y), strict=True):  # type: ignore[attr-defined]
             np.testing.assert_allclose(mine, plain, rtol=1e-12, atol=1e-12 * (1 + np.abs(plain).max()))
 
 

@@ -11,10 +11,10 @@ import kalmark as km
 from kalmark.arrays import Array
 from kalmark.declare import built_in, parameters
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
-from kalmark.models.observe import linearize
+from kalmark.models.observe import PythonView, linearize, view_of
 from kalmark.models.protocols import POSE, TWIST, world_of
 from kalmark.models.state_sensors import StateSensor
-from kalmark.models.state_view import PythonStateView, sees_state, state_view_of
+from kalmark.models.state_view import sees_state
 
 SENSORS = [cls for cls in built_in("sensor") if issubclass(cls, StateSensor)]
 PLANE, SPACE, COASTING = km.motion.Unicycle(), km.motion.Odometry3D(), km.motion.ConstantVelocity3D()
@@ -54,7 +54,7 @@ def test_jacobians_in_every_argument_are_those_of_differences(cls: Any, motion: 
     rng, plane = np.random.default_rng(3), motion is PLANE
     pose, sensor = (SE2 if plane else SE3), with_sigmas(cls)
     at, own = drawn(mount_space(pose.size), rng), len(sensor.parameters)
-    view, in_python = state_view_of(sensor, motion, at), PythonStateView(sensor, motion, at, np.array(sensor.angular))
+    view, in_python = view_of(sensor, None, at, motion), PythonView(sensor, None, at, np.array(sensor.angular), motion)
     head_space = Space("head", (*pose.kinds, *mount_space(pose.size, own).kinds))
     block = motion.space if sees_state(sensor, motion) else pose
     for _ in range(5):

@@ -106,7 +106,7 @@ def routines(axes: int, inverse_depths: bool, dependent: bool) -> Routines:
     """
     iterates = address_of(compiled_iterate, ITERATE)  # first: what `compile_correction` does is waited for here
     first = address_of(retract_plane if axes == 1 else retract, RETRACT), generator_address(axes), iterates
-    rays = (sensor_address(axes), *parallax.addresses()) if inverse_depths else (0, 0, 0, 0, 0)
+    rays = (sensor_address(), *parallax.addresses()) if inverse_depths else (0, 0, 0, 0, 0)
     return (*first, *gauge_transport.addresses(dependent), *rays)
 
 

@@ -33,6 +33,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.errors import ModelError
 from kalmark.geometry.directions import unit_many
+from kalmark.models.landmarks3d import multiply_many
 
 RADIAL, RADTAN, EQUIDISTANT, OMNI, TSAI, DAVISON, FOV = range(7)
 LENSES = {
@@ -86,23 +87,24 @@ def one_number_limit(lens: str, d: Array) -> float:
 def project(lens: int, v: Array, par: Array) -> tuple[Array, Array]:
     """Return the pixels e (K, 2) of v (K, 3), and E_v (K, 2, 3); NaN where the lens shows nothing."""
     d = par[HEAD : HEAD + int(par[5])]
-    if lens == OMNI:
-        return project_omni(v, par[:5], d)
-    if lens == EQUIDISTANT:
-        e, E_v = _project_equidistant(v, par[:4], d)
-    elif lens == RADTAN:
+    if lens == RADTAN:
         e, E_v = _project_radtan(v, par[:4], d)
-    elif lens >= TSAI:
-        e, E_v = _project_radius(lens, v, par)
-    else:
+    elif lens == RADIAL:
         e, E_v = project_pinhole(v, par[:4], d)
+    else:
+        return _project_round(lens, v, par)
     for i in range(len(v)):
-        flat = math.hypot(v[i, 0], v[i, 1])
-        angle = math.atan2(flat, v[i, 2])
-        shown = angle < par[4] if lens == EQUIDISTANT else v[i, 2] > 0.0 and flat < par[4] * v[i, 2]
-        for a in range(0 if shown else 2):
+        for a in range(0 if is_shown(lens, math.hypot(v[i, 0], v[i, 1]), v[i, 2], par) else 2):
             e[i, a] = E_v[i, a, 0] = E_v[i, a, 1] = E_v[i, a, 2] = np.nan
     return e, E_v
+
+
+@compiled
+def is_shown(lens: int, flat: float, z: float, par: Array) -> bool:
+    """Return whether a lens shows what is `flat` off the axis and z ahead."""
+    if lens == EQUIDISTANT:
+        return math.atan2(flat, z) < par[4]
+    return lens == OMNI or (z > 0.0 and flat < par[4] * z)
 
 
 def back_project(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
@@ -111,16 +113,7 @@ def back_project(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
     RADIAL and OMNI are as good as their second polynomial; all others invert `project` to the last digit, NaN for
     pixels that the lens cannot reach.
     """
-    n = HEAD + int(par[5])
-    if lens == OMNI:
-        return back_project_omni(y, par[:5], par[n:])
-    if lens == EQUIDISTANT:
-        return _back_project_equidistant(y, par)
-    if lens == RADTAN:
-        return _back_project_radtan(y, par)
-    if lens >= TSAI:
-        return _back_project_radius(lens, y, par)
-    return back_project_pinhole(y, par[:4], par[n:])
+    return _back_project_radtan(y, par) if lens == RADTAN else _back_project_round(lens, y, par)
 
 
 def is_in_view(lens: int, v: Array, par: Array, size: Array) -> Flags:
@@ -195,21 +188,16 @@ def _project_radtan(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
 
 @compiled
 def _back_project_radtan(y: Array, par: Array) -> tuple[Array, Array]:
-    v, X_y = np.ones((len(y), 3)), np.empty((len(y), 2, 2))
+    v, V_y = np.ones((len(y), 3)), np.zeros((len(y), 3, 2))
     for i in range(len(y)):
         u0, u1 = (y[i, 0] - par[2]) / par[0], (y[i, 1] - par[3]) / par[1]
         v[i, :2] = undistort(u0, u1, par[HEAD : HEAD + 5], par[4])
         J = radtan_many(v[i : i + 1, :2], par[HEAD : HEAD + 5])[1][0]
         det = J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0]
-        X_y[i, 0, 0], X_y[i, 0, 1] = J[1, 1] / (det * par[0]), -J[0, 1] / (det * par[1])
-        X_y[i, 1, 0], X_y[i, 1, 1] = -J[1, 0] / (det * par[0]), J[0, 0] / (det * par[1])
+        V_y[i, 0, 0], V_y[i, 0, 1] = J[1, 1] / (det * par[0]), -J[0, 1] / (det * par[1])
+        V_y[i, 1, 0], V_y[i, 1, 1] = -J[1, 0] / (det * par[0]), J[0, 0] / (det * par[1])
     m, M_v = unit_many(v)
-    M_y = np.empty((len(y), 3, 2))
-    for i in range(len(y)):
-        for a in range(3):
-            for b in range(2):
-                M_y[i, a, b] = M_v[i, a, 0] * X_y[i, 0, b] + M_v[i, a, 1] * X_y[i, 1, b]
-    return m, M_y
+    return m, multiply_many(M_v, V_y)
 
 
 @compiled
@@ -237,42 +225,94 @@ def undistort(u0: float, u1: float, d: Array, limit: float) -> Array:
     return x[0]
 
 
+# ---------------------------------------------------------------------- lenses that are round: radius to radius
 @compiled
-def _project_equidistant(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
-    """Project by the angle from the axis: regular on the axis ahead, and at right angles to it."""
-    e, E_v = np.empty((len(v), 2)), np.empty((len(v), 2, 3))
+def image_affine(lens: int, par: Array) -> tuple[float, float, float, float, float, float]:
+    """Return the centre of the image in pixels, and the matrix A, row by row, from a place about it to pixels."""
+    if lens == OMNI:
+        return par[0], par[1], 1.0, par[4], par[3], par[2]
+    return par[2], par[3], par[0], 0.0, 0.0, par[1]
+
+
+@compiled
+def image_radius(lens: int, flat: float, z: float, par: Array) -> tuple[float, float, float]:
+    """Return the radius in the image of what is `flat` off the axis and z ahead, and its derivatives in both."""
+    d = par[HEAD : HEAD + int(par[5])]
+    if lens in (EQUIDISTANT, OMNI):
+        if lens == OMNI:
+            radius, rate = polynomial(d, math.atan2(z, flat))
+        else:
+            radius, rate = distortion_polynomial(math.atan2(flat, z), d)
+        rate *= (-1.0 if lens == OMNI else 1.0) / (flat * flat + z * z)
+        return radius, rate * z, -rate * flat
+    radius, rate = distorted_radius(lens, flat / z, par)
+    return radius, rate / z, -rate * flat / (z * z)
+
+
+@compiled
+def ray_at_radius(lens: int, radius: float, par: Array) -> tuple[float, float, float, float]:
+    """Return how far off the axis and ahead the ray of a radius in the image goes, each with its derivative."""
+    n = HEAD + int(par[5])
+    if lens == OMNI:
+        ahead, rate = polynomial(par[n:], radius)
+        return radius, 1.0, ahead, rate
+    if lens == EQUIDISTANT:
+        angle = invert_distortion(radius, par[HEAD:n], par[4])
+        rate = 1.0 / distortion_polynomial(angle, par[HEAD:n])[1]
+        return math.sin(angle), rate * math.cos(angle), math.cos(angle), -rate * math.sin(angle)
+    flat, rate = undistorted_radius(lens, radius, par)
+    return flat, rate, 1.0, 0.0
+
+
+@compiled
+def scale_radius(x: float, y: float, radius: float, rate: float, S: Array) -> tuple[float, float, float]:
+    """Return the direction of (x, y), (0, 0) at the centre, and the scale that brings it to a radius.
+
+    S (2, 2) becomes the Jacobian of what is scaled, `rate` being the derivative of the radius.
+    """
+    r = math.hypot(x, y)
+    p, q, scale = (x / r, y / r, radius / r) if r > 0.0 else (0.0, 0.0, rate)
+    S[0, 0], S[1, 1] = scale + (rate - scale) * p * p, scale + (rate - scale) * q * q
+    S[0, 1] = S[1, 0] = (rate - scale) * p * q
+    return p, q, scale
+
+
+@compiled
+def _project_round(lens: int, v: Array, par: Array) -> tuple[Array, Array]:
+    """Project by the radius; OMNI: what is next to the axis itself is at the centre."""
+    e, E_v, S = np.empty((len(v), 2)), np.empty((len(v), 2, 3)), np.empty((2, 2))
+    c_u, c_v, a, b, c, d = image_affine(lens, par)
     for i in range(len(v)):
-        x, y, z = v[i, 0], v[i, 1], v[i, 2]
+        x, y, z = v[i]
         flat = math.hypot(x, y)
-        r2 = flat * flat + z * z
-        radius, rate = distortion_polynomial(math.atan2(flat, z), d)
-        cos, sin, scale = (x / flat, y / flat, radius / flat) if flat > 0.0 else (1.0, 0.0, 1.0 / z)
-        along, ahead = rate * z / r2, -rate * flat / r2  # d radius / d flat, / d z
-        e[i, 0], e[i, 1] = k[2] + k[0] * radius * cos, k[3] + k[1] * radius * sin
-        E_v[i, 0, 0] = k[0] * (along * cos * cos + scale * sin * sin)
-        E_v[i, 1, 1] = k[1] * (along * sin * sin + scale * cos * cos)
-        E_v[i, 0, 1], E_v[i, 1, 0] = k[0] * (along - scale) * cos * sin, k[1] * (along - scale) * cos * sin
-        E_v[i, 0, 2], E_v[i, 1, 2] = k[0] * ahead * cos, k[1] * ahead * sin
+        if flat <= 1e-12 * abs(z):
+            x = y = flat = 0.0
+        shown = is_shown(lens, flat, z, par)
+        radius, along, ahead = image_radius(lens, flat, z, par) if shown else (np.nan, np.nan, np.nan)
+        p, q, scale = scale_radius(x, y, radius, along, S)
+        e[i, 0], e[i, 1] = c_u + scale * (a * x + b * y), c_v + scale * (c * x + d * y)
+        for j in range(2):
+            E_v[i, 0, j], E_v[i, 1, j] = a * S[0, j] + b * S[1, j], c * S[0, j] + d * S[1, j]
+        E_v[i, 0, 2], E_v[i, 1, 2] = ahead * (a * p + b * q), ahead * (c * p + d * q)
     return e, E_v
 
 
 @compiled
-def _back_project_equidistant(y: Array, par: Array) -> tuple[Array, Array]:
-    d = par[HEAD : HEAD + int(par[5])]
-    m, M_y = np.empty((len(y), 3)), np.empty((len(y), 3, 2))
+def _back_project_round(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
+    v, V_y, S = np.empty((len(y), 3)), np.empty((len(y), 3, 2)), np.empty((2, 2))
+    c_u, c_v, a, b, c, d = image_affine(lens, par)
+    det = a * d - b * c
     for i in range(len(y)):
-        p, q = (y[i, 0] - par[2]) / par[0], (y[i, 1] - par[3]) / par[1]
-        radius = math.hypot(p, q)
-        theta = invert_distortion(radius, d, par[4])
-        c, s = math.cos(theta), math.sin(theta)
-        cos, sin, scale = (p / radius, q / radius, s / radius) if radius > 0.0 else (1.0, 0.0, 1.0)
-        rate = 1.0 / distortion_polynomial(theta, d)[1]
-        m[i, 0], m[i, 1], m[i, 2] = s * cos, s * sin, c
-        M_y[i, 0, 0] = (rate * c * cos * cos + scale * sin * sin) / par[0]
-        M_y[i, 1, 1] = (rate * c * sin * sin + scale * cos * cos) / par[1]
-        M_y[i, 0, 1], M_y[i, 1, 0] = (rate * c - scale) * cos * sin / par[1], (rate * c - scale) * cos * sin / par[0]
-        M_y[i, 2, 0], M_y[i, 2, 1] = -rate * s * cos / par[0], -rate * s * sin / par[1]
-    return m, M_y
+        du, dv = y[i, 0] - c_u, y[i, 1] - c_v
+        x_d, y_d = (d * du - b * dv) / det, (a * dv - c * du) / det
+        flat, rate, v[i, 2], ahead = ray_at_radius(lens, math.hypot(x_d, y_d), par)
+        p, q, scale = scale_radius(x_d, y_d, flat, rate, S)
+        v[i, 0], v[i, 1] = scale * x_d, scale * y_d
+        for j in range(3):
+            V_p, V_q = (S[j, 0], S[j, 1]) if j < 2 else (ahead * p, ahead * q)
+            V_y[i, j, 0], V_y[i, j, 1] = (V_p * d - V_q * c) / det, (V_q * a - V_p * b) / det
+    m, M_v = unit_many(v)
+    return m, multiply_many(M_v, V_y)
 
 
 @compiled
@@ -292,7 +332,9 @@ def distorted_radius(lens: int, r: float, par: Array) -> tuple[float, float]:
 
 @compiled
 def undistorted_radius(lens: int, rd: float, par: Array) -> tuple[float, float]:
-    """Return the r on the plane z = 1 of r_d >= 0 in the image by TSAI, DAVISON or FOV, and its derivative; or NaN."""
+    """Return the r on the plane z = 1 of r_d >= 0 in the image, and its derivative; or NaN.  RADIAL: the correction."""
+    if lens == RADIAL:
+        return distortion_polynomial(rd, par[HEAD + int(par[5]) :])
     d = par[HEAD]
     if lens == DAVISON:
         rest = 1.0 - 2.0 * d * rd * rd
@@ -302,45 +344,6 @@ def undistorted_radius(lens: int, rd: float, par: Array) -> tuple[float, float]:
         return (math.tan(rd * d) / t, d / (t * c * c)) if rd * d < 0.5 * math.pi else (np.nan, np.nan)
     n = HEAD + int(par[5])
     return distortion_polynomial(rd, par[HEAD:n]) if rd < par[n] else (np.nan, np.nan)
-
-
-@compiled
-def _project_radius(lens: int, v: Array, par: Array) -> tuple[Array, Array]:
-    x, X_v = plane_many(v)
-    XD_x = np.empty((len(v), 2, 2))
-    for i in range(len(v)):
-        r = math.hypot(x[i, 0], x[i, 1])
-        rd, rate = distorted_radius(lens, r, par) if v[i, 2] > 0.0 and r < par[4] else (np.nan, np.nan)
-        _scaled(x[i], XD_x[i], r, rd, rate)
-    return _pixels(par[:4], x, XD_x, X_v)
-
-
-@compiled
-def _back_project_radius(lens: int, y: Array, par: Array) -> tuple[Array, Array]:
-    v, X_xd, M_y = np.ones((len(y), 3)), np.empty((len(y), 2, 2)), np.empty((len(y), 3, 2))
-    for i in range(len(y)):
-        v[i, 0], v[i, 1] = (y[i, 0] - par[2]) / par[0], (y[i, 1] - par[3]) / par[1]
-        rd = math.hypot(v[i, 0], v[i, 1])
-        r, rate = undistorted_radius(lens, rd, par)
-        _scaled(v[i], X_xd[i], rd, r, rate)
-    m, M_v = unit_many(v)
-    for i in range(len(y)):
-        for a in range(3):
-            for b in range(2):
-                M_y[i, a, b] = (M_v[i, a, 0] * X_xd[i, 0, b] + M_v[i, a, 1] * X_xd[i, 1, b]) / par[b]
-    return m, M_y
-
-
-@compiled
-def _scaled(x: Array, J: Array, r: float, new: float, rate: float) -> None:
-    """Bring x (2 or 3,) in place from the radius r to the new one; J (2, 2) becomes the Jacobian."""
-    scale = new / r if r > 0.0 else rate
-    for a in range(2):
-        for b in range(2):
-            along = (rate - scale) * x[a] * x[b] / (r * r) if r > 0.0 else 0.0
-            J[a, b] = along + (scale if a == b else 0.0)
-    x[0] *= scale
-    x[1] *= scale
 
 
 # ---------------------------------------------------------------------- pin holes
@@ -410,24 +413,9 @@ def calibrate_pinhole(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
     return E_k, E_d
 
 
-@compiled
 def back_project_pinhole(y: Array, k: Array, c: Array) -> tuple[Array, Array]:
     """Return the viewing rays m (K, 3), unit vectors, of pixels y (K, 2), M_y (K, 3, 2); c: `fit_correction`."""
-    xd = np.empty((len(y), 2))
-    for i in range(len(y)):
-        for a in range(2):
-            xd[i, a] = (y[i, a] - k[2 + a]) / k[a]
-    x, X_xd, _ = radial_many(xd, c)
-    v = np.ones((len(y), 3))
-    for i in range(len(y)):
-        v[i, 0], v[i, 1] = x[i, 0], x[i, 1]
-    m, M_v = unit_many(v)
-    M_y = np.empty((len(y), 3, 2))
-    for i in range(len(y)):
-        for a in range(3):
-            for b in range(2):
-                M_y[i, a, b] = (M_v[i, a, 0] * X_xd[i, 0, b] + M_v[i, a, 1] * X_xd[i, 1, b]) / k[b]
-    return m, M_y
+    return back_project(RADIAL, y, np.concatenate([k, [math.inf, 0.0], c]))
 
 
 def valid_radius(d: Any) -> float:
@@ -492,58 +480,21 @@ def polynomial(a: Array, x: float) -> tuple[float, float]:
     return value, rate
 
 
-@compiled
 def project_omni(v: Array, k: Array, a: Array) -> tuple[Array, Array]:
     """Return the pixels e (K, 2) of v (K, 3), and E_v (K, 2, 3), of an omnidirectional camera.
 
     k = (cx, cy, c, d, e), the centre and the affine matrix [[1, e], [d, c]] in (u, v); a: the radius in the image as a
     polynomial of the angle above the image plane, atan2(z, hypot(x, y)).  On the axis itself the pixel is the centre.
     """
-    e, E_v = np.empty((len(v), 2)), np.empty((len(v), 2, 3))
-    for i in range(len(v)):
-        x, y, z = v[i, 0], v[i, 1], v[i, 2]
-        flat2 = x * x + y * y
-        flat, r2 = math.sqrt(flat2), flat2 + z * z
-        radius, rate = polynomial(a, math.atan2(z, flat))
-        if flat > 1e-12 * abs(z):
-            cos, sin, scale = x / flat, y / flat, radius / flat
-        else:
-            cos, sin, scale, radius = 1.0, 0.0, -rate / z, 0.0
-        along = -rate * z / r2  # d radius / d flat
-        p, q = radius * cos, radius * sin
-        P_x, P_y, Q_y = along * cos * cos + scale * sin * sin, (along - scale) * cos * sin, along * sin * sin
-        Q_y += scale * cos * cos
-        P_z, Q_z = rate * flat / r2 * cos, rate * flat / r2 * sin
-        e[i, 0], e[i, 1] = k[0] + p + k[4] * q, k[1] + k[3] * p + k[2] * q
-        E_v[i, 0, 0], E_v[i, 0, 1], E_v[i, 0, 2] = P_x + k[4] * P_y, P_y + k[4] * Q_y, P_z + k[4] * Q_z
-        E_v[i, 1, 0], E_v[i, 1, 1] = k[3] * P_x + k[2] * P_y, k[3] * P_y + k[2] * Q_y
-        E_v[i, 1, 2] = k[3] * P_z + k[2] * Q_z
-    return e, E_v
+    return project(OMNI, v, np.concatenate([k, [len(a)], a]))
 
 
-@compiled
 def back_project_omni(y: Array, k: Array, b: Array) -> tuple[Array, Array]:
     """Return the viewing rays m (K, 3), unit vectors, of pixels y (K, 2), and M_y (K, 3, 2).
 
     k as in `project_omni`; b: the height z as a polynomial of the radius in the image, the ray being (p, q, z).
     """
-    v, V_y = np.empty((len(y), 3)), np.zeros((len(y), 3, 2))
-    det = k[2] - k[3] * k[4]
-    for i in range(len(y)):
-        du, dv = y[i, 0] - k[0], y[i, 1] - k[1]
-        p, q = (k[2] * du - k[4] * dv) / det, (dv - k[3] * du) / det
-        radius = math.sqrt(p * p + q * q)
-        v[i, 0], v[i, 1] = p, q
-        v[i, 2], rate = polynomial(b, radius)
-        V_y[i, 0, 0], V_y[i, 0, 1], V_y[i, 1, 0], V_y[i, 1, 1] = k[2] / det, -k[4] / det, -k[3] / det, 1.0 / det
-        if radius > 0.0:
-            for j in range(2):
-                V_y[i, 2, j] = rate * (p * V_y[i, 0, j] + q * V_y[i, 1, j]) / radius
-    m, M_v = unit_many(v)
-    M_y = np.empty((len(y), 3, 2))
-    for i in range(len(y)):
-        M_y[i] = M_v[i] @ V_y[i]
-    return m, M_y
+    return back_project(OMNI, y, np.concatenate([k, [0.0], b]))
 
 
 @compiled

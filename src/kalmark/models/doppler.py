@@ -2,23 +2,22 @@
 
 A landmark at p in the sensor's frame, of a sensor with the velocity t in the same frame, has the rate of its range
 d|p|/dt = -p' t / |p|: a turn of the sensor does not change a distance.  So what is seen is v = (p, t), and how it comes
-about is in `models/velocity_view.py`.
+about is in `models/observe.py`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import KW_ONLY
 from typing import Annotated, ClassVar
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
-from kalmark.declare import Limit, NotNegative, Positive, declared, register
+from kalmark.declare import Positive, declared, register
 from kalmark.geometry.directions import inv_spherical_many, spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
-from kalmark.models.landmark_views import Expecting, refuse_negative_ranges, residual
+from kalmark.models.landmark_views import Cone, refuse_negative_ranges, residual
 
 __all__ = ["Radar2D", "Radar3D", "RangeRate2D", "RangeRate3D"]
 
@@ -51,14 +50,10 @@ def expect_range_rate(code: int, par: Array, angular: Flags, v: Array, y: Array)
 
 
 @declared
-class _Doppler(Expecting):
+class _Doppler(Cone):
     """Base of these sensors: limits of range, and the expectation."""
 
     sigma_rate_mps: Annotated[Positive, "Noise of the range rate."] = 0.1
-    _: KW_ONLY
-    range_min_m: Annotated[NotNegative, "Nearest landmark that is measured."] = 0.0
-    range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
-    fov_rad: Annotated[Positive, "Field of view about the sensor's x axis."] = 2 * math.pi
 
     world: ClassVar[str]
     columns: ClassVar[tuple[str, ...]] = ("range_rate_mps",)
@@ -66,13 +61,6 @@ class _Doppler(Expecting):
     expected = expect_range_rate
     additive: ClassVar[bool] = True
     sees_velocity: ClassVar[bool] = True
-
-    def sees(self, v: Array) -> Flags:
-        """Return which of v (K, d or 2 d), which begin with points, are within the limits of sight."""
-        p = v[:, : 2 if self.world == "plane" else 3]
-        distance, off = np.linalg.norm(p, axis=1), np.arctan2(np.linalg.norm(p[:, 1:], axis=1), p[:, 0])
-        inside: Flags = (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
-        return inside
 
 
 @register("sensor", "range_rate")
@@ -90,6 +78,7 @@ class RangeRate2D(_Doppler):
     """
 
     world = "plane"
+    point_size = 2
     sees_kinds = ("point",)
 
 
@@ -130,6 +119,7 @@ class Radar2D(_Doppler):
     sigma_bearing_rad: Annotated[Positive, "Noise of the bearing."] = 0.02
 
     world = "plane"
+    point_size = 2
     sees_kinds = ("point",)
     columns = ("range_m", "bearing_rad", "range_rate_mps")
     sigmas = ("sigma_range_m", "sigma_bearing_rad", "sigma_rate_mps")

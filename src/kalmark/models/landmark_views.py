@@ -77,25 +77,19 @@ def with_distance(l: Array, rays: tuple[Array, Array, Array]) -> tuple[Array, Ar
     return v, V_T, V_l
 
 
-@compiled
-def oneself(T: Array, l: Array) -> tuple[Array, Array, Array]:
-    """Return where T itself is, (1, 2 or 3), V_T and V_l = 0: an absolute position fix observes no landmark."""
-    d = 2 if len(T) == 3 else 3
-    V_T = np.zeros((1, d, 3 if d == 2 else 6))
-    for j in range(d):
-        V_T[0, j, j] = 1.0
-    return T[:d].copy().reshape((1, d)), V_T, np.zeros((1, d, l.shape[1]))
-
-
 # ------------------------------------------------------------------ sensors
 @compiled
-def position(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z (K, d), E_v (K, d, d) of a measurement of v (K, d) itself."""
-    k, d = v.shape
-    E_v = np.zeros((k, d, d))
-    for j in range(d):
-        E_v[:, j, j] = 1.0
-    return v.copy(), y - v, E_v
+def components(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return e, z (K, m), E_v (K, m, errors of a view) of m numbers of v (K, d), from number `code` on, plus `par`.
+
+    v is a point, a twist or a pose; of a pose of space, that has 6 errors, only the position.
+    """
+    k, m = y.shape
+    e, E_v = np.empty((k, m)), np.zeros((k, m, 6 if v.shape[1] == 7 else v.shape[1]))
+    for i in range(k):
+        for j in range(m):
+            e[i, j], E_v[i, j, code + j] = v[i, code + j] + (par[j] if len(par) > 0 else 0.0), 1.0
+    return e, residual(y, e, angular), E_v
 
 
 @compiled
@@ -262,6 +256,11 @@ class Expecting(Sensing):
         """Return the expected measurements (K, m) of views v (K, d), and E_v (K, p, d or the view's errors)."""
         return self._expected(v, np.zeros((len(v), len(self.columns))))
 
+    def parameters_jacobian(self, v: Array) -> Array:
+        """Return E_p (K, p, c): how the expected measurements of v (K, d) change with the c parameters."""
+        e, angular = self.expect(v)[0], np.array(self.angular, dtype=np.bool_)
+        return np.asarray(type(self).varied(self.code, self.constants, angular, np.ascontiguousarray(v), e))
+
     def _expected(self, v: Array, y: Array) -> tuple[Array, Array]:
         angular = np.array(self.angular, dtype=np.bool_)
         v, y = np.ascontiguousarray(v, dtype=np.float64), np.ascontiguousarray(y, dtype=np.float64)
@@ -294,11 +293,14 @@ class Cone(Expecting):
     range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
     fov_rad: Annotated[Positive, "Field of view, a cone about the sensor's x axis."] = 2 * math.pi
 
+    point_size: ClassVar[int] = 3  # numbers of a view that are the point
+
     def sees(self, v: Array) -> Flags:
-        """Return which of v (K, 3) lie within the range limits and the cone of sight about x."""
-        distance = np.linalg.norm(v, axis=1)
-        off = np.arctan2(np.hypot(v[:, 1], v[:, 2]), v[:, 0])
-        return (self.range_min_m <= distance) & (distance <= self.range_max_m) & (off <= self.fov_rad / 2)
+        """Return which of v (K, d), that begin with points, lie within the range limits and the cone about x."""
+        v = v[:, : self.point_size]
+        distance, off = np.linalg.norm(v, axis=1), np.arctan2(np.linalg.norm(v[:, 1:], axis=1), v[:, 0])
+        inside: Flags = (self.range_min_m <= distance) & (distance <= self.range_max_m)
+        return inside & (off <= self.fov_rad / 2)
 
 
 class Distancing(Expecting):

@@ -62,10 +62,6 @@ class Point2D(_Landmark):
     look = staticmethod(landmarks2d.point_seen_from)
     of = staticmethod(landmarks2d.point_from_view)
 
-    def place(self, l: Array) -> tuple[Array, Array]:
-        """Return the positions (K, 2) and their Jacobian (K, 2, d)."""
-        return np.array(l[:, :2]), np.tile(np.eye(2, l.shape[1]), (len(l), 1, 1))
-
 
 @register("landmark", "point_signature")
 class PointSignature2D(Point2D):
@@ -191,8 +187,6 @@ class Point3D(_Landmark):
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the points themselves (K, 3) and the identity."""
         return np.array(l), np.tile(np.eye(3), (len(l), 1, 1))
-
-    place = to_point
 
 
 @declared
@@ -404,8 +398,6 @@ class Tag(_Landmark):
     def to_point(self, l: Array) -> tuple[Array, Array]:
         """Return the centres (K, 3) and their Jacobian (K, 3, 6)."""
         return np.array(l[:, :3]), np.tile(np.eye(3, 6), (len(l), 1, 1))
-
-    place = to_point
 
 
 @declared

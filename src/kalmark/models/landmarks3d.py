@@ -83,11 +83,11 @@ def homogeneous_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
 
 @compiled
 def multiply_many(A: Array, B: Array) -> Array:
-    """Return the products (K, a, c) of K matrices (K, a, b) and (K, b, c)."""
+    """Return the products (K, a, c) of the first b columns of K matrices (K, a, b or more) with (K, b, c)."""
     C = np.zeros((len(A), A.shape[1], B.shape[2]))
     for i in range(len(A)):
         for a in range(A.shape[1]):
-            for b in range(A.shape[2]):
+            for b in range(B.shape[1]):
                 for c in range(B.shape[2]):
                     C[i, a, c] += A[i, a, b] * B[i, b, c]
     return C

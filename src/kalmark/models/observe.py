@@ -1,9 +1,18 @@
-"""Observation models: composition of a sensor on a robot and a landmark, by the chain rule.  [S] A.5, (63), (64).
+"""Observation models: one chain from the robot to what a sensor measures, by the chain rule.  [S] A.5, (63), (64).
 
-`expectation` is the readable form and serves any models.  The filter's kernels call `linearize`: plain
-Python for a model written in Python, the compiled twin below for the built-in ones.  Both are tested to be equal.
-The head is the robot's pose or, for a mount in the map, the pose and the mount, and behind it the parameters that the
-sensor has in the map, gain and offset of its range.  Sensors of the robot itself have their own: `state_view.py`.
+    compose(robot, mount) -> look(landmark) -> expect(sensor)         a sensor of landmarks
+    chain(robot, mount, state or clone)     -> expect(sensor)         a sensor of its own robot: `state_view.py`
+    compose -> (look, chain)                -> expect(sensor)         one that sees its own velocity, too
+
+What is before `expect` are the links of a chain, one function for each of the three, which goes by its address.
+`expectation` is the readable form of the first.  The filter's kernels call `linearize`: `linearize_chain`, compiled,
+for the built-in models, a `PythonView` for a user's.  Both are tested to be equal.  What is behind the robot's pose in
+the head is, where the map has it, the mount, with the parameters that the sensor has in the map behind it; of a sensor
+that sees its own velocity, whose mount is known, it is the block that tells this: the state or a clone.
+
+Any of the blocks may be a given value, of which no Jacobian is asked for: a mount that is not in the head, and what
+stands behind the numbers that are measured.  Those are the numbers of a landmark known exactly, and for a sensor of
+the state the time since its last reading and the control in force, or the mean of earlier readings and that time.
 
 Motions are at the end: a built-in one is compiled and called by its address, a user's is run in Python.
 """
@@ -11,8 +20,8 @@ Motions are at the end: a built-in one is compiled and called by its address, a 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numba import types
@@ -29,40 +38,50 @@ from kalmark.models import landmark_views, landmarks, sensors
 from kalmark.models.landmark_views import EXPECT, LOOK, VARY, residual
 from kalmark.models.landmarks3d import multiply_many
 from kalmark.models.protocols import (
+    TWIST,
     Completing,
     FullSensor,
     Landmark,
     Motion,
+    SeesVelocity,
     Sensor,
     finds_depth,
     parameter_covariance,
+    tells_velocity,
 )
+from kalmark.models.state_view import CHAIN, CHAINS, VELOCITY, call_chain, seen, sees_state, velocity_of
 
-View = tuple[int, int, int, int, Array, Array, Flags, int]
-# addresses of a `linearize_in_...`, the landmark's `look`, the sensor's `expected`; code, mount, parameters, angles;
-# address of the sensor's `varied`, 0 where its parameters are known
-VIEW = "Tuple((i8, i8, i8, i8, f8[::1], f8[::1], b1[::1], i8))"
+View = tuple[int, int, int, int, int, int, int, int, int, Array, Array, Flags]
+# addresses of a linearizer, its `links`, `compose`, the chain of a state (0: none), the landmark's `look` (0: none),
+# the sensor's `expected`, its `varied` (0: its parameters are known), the motion's `velocity` (0: the state has none);
+# then the sensor's code, mount, parameters (of one that sees its velocity: the time since the last scan and the
+# control), angles
+VIEW = "Tuple((i8, i8, i8, i8, i8, i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
 LINEARIZE = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
-SENSOR_AT = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], f8[::1])")
+SENSOR_AT = signature_of("Tuple((f8[::1], f8[:, ::1]))(i8, f8[::1], i8, f8[::1])")
+COMPOSE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1])")
+# of view, head, landmarks l and the given block: v (K, d), V_T (K, d, n) of what is between, T_h (n, h), V_l (K, d, n)
+LINKS = signature_of(
+    f"Tuple((f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
+)
 call_linearize, call_sensor_at = by_address(LINEARIZE), by_address(SENSOR_AT)
-MOUNT = 4  # where a view has the mount
+call_compose, call_links = by_address(COMPOSE), by_address(LINKS)
+MOUNT: Final = 9  # where a view has the mount
 
 # of the state r (size,), the control u (m,), parameters and seconds: the new r, R_r (dof, dof), R_u (dof, m)
 MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")
 call_move = by_address(MOVE)
 
-# of the state r (size,) and parameters: the velocity in the robot's frame b (3 or 6,) and B_r (3 or 6, dof)
-VELOCITY = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], f8[::1])")
-call_velocity = by_address(VELOCITY)
-
+Links = tuple[Array, Array, Array, Array]
 NOTHING = np.zeros(0)
+COMPOSES = {3: compose, 7: frames3d.compose}  # by the size of a pose
 
 
 def sensor_pose(r: Array, mount: Array) -> tuple[Array, Array, Array]:
     """Return the sensor's pose T = r o mount with T_r and T_s, in the plane (3,) or in space (7,)."""
-    return compose(r, mount) if len(r) == 3 else frames3d.compose(r, mount)
+    return COMPOSES[len(r)](r, mount)
 
 
 def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: Array) -> tuple[Array, ...]:
@@ -102,79 +121,111 @@ def _product(A: Array, B: Array) -> Array:
 
 @dataclass(frozen=True)
 class PythonView:
-    """A sensor on its mount looking at one type of landmark, evaluated in Python."""
+    """The chain of a user's sensor, landmark or motion, evaluated in Python; without a landmark it is of the state.
 
-    sensor: Sensor
-    landmark: Landmark
+    `since` (1 + k,) of a sensor that sees its own velocity: the seconds since its last scan and the control in force.
+    """
+
+    sensor: Any
+    landmark: Landmark | None
     mount: Array
     angular: Flags
+    motion: Any = None
+    since: Array = field(default_factory=lambda: NOTHING)
+
+    @property
+    def moving(self) -> bool:
+        """True if the block behind the robot's pose tells the sensor's velocity, and is no mount."""
+        return self.landmark is not None and isinstance(self.sensor, SeesVelocity)
 
     def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """Return e (K, m), z = y - e, E_h (K, m, 3 or more) and E_l (K, m, n)."""
-        size = len(self.mount)
-        r, mount = head[:size], head[size : 2 * size] if len(head) > size else self.mount
-        if len(head) <= 2 * size:
-            e, E_r, E_s, E_l = expectation(r, mount, self.sensor, self.landmark, l)
-            E_h = E_r if len(head) == size else np.concatenate([E_r, E_s], axis=2)
-            return e, residual(y, e, self.angular), E_h, E_l
-        sensor: Any = self.sensor
-        sensor = sensor.with_parameters(head[2 * size :])
-        e, E_r, E_s, E_l = expectation(r, mount, sensor, self.landmark, l)
-        E_p = sensor.parameters_jacobian(self.landmark.seen_from(sensor_pose(r, mount)[0], l)[0])
-        return e, residual(y, e, self.angular), np.concatenate([E_r, E_s, E_p], axis=2), E_l
+        """Return e (K, m), z (K, p), E_h (K, p, 3 or more) and E_l (K, p, n), as `linearize_chain` does."""
+        pose, m, sensor = len(self.mount), len(self.angular), self.sensor
+        r, behind, measured, given = head[:pose], head[pose:], y[:, :m], y[:, m:]
+        s, own = self.mount, behind[:0]
+        if len(behind) and not self.moving:
+            s, own = behind[:pose], behind[pose:]
+        if len(own):
+            sensor = sensor.with_parameters(own)
+        v, V_r, V_s, V_l = self._view(r, s, behind, l, given)
+        e, E_v = sensor.expect(v)
+        parts = [E_v @ V_r, *([E_v @ V_s] if len(behind) else [])]
+        if len(own):
+            parts.append(sensor.parameters_jacobian(v))
+        known = given.shape[1] > 0 and self.landmark is not None
+        z, E_l = residual(measured, e, self.angular), np.zeros((*e.shape, 0)) if known else E_v @ V_l
+        return np.concatenate([e, given], axis=1), z, np.concatenate(parts, axis=2), E_l
 
-
-def fix_view(antenna: Array) -> View:
-    """Return the view of an absolute position fix whose antenna sits at `antenna` (3,) or (7,) in the robot's frame."""
-    return built_in_view(
-        landmark_views.oneself, landmark_views.position, 0, antenna, NOTHING.copy(), np.zeros(3, dtype=np.bool_)
-    )
-
-
-def built_in_view(
-    look: Any,
-    expect: Any,
-    code: int,
-    mount: Array,
-    par: Array,
-    angular: Flags,
-    varied: Any = None,
-    linearized: Any = None,
-) -> View:
-    """Return the view of a landmark's `look` and a sensor's `expected`, compiled now; `mount` (3,) or (7,).
-
-    `varied` is that of a sensor with parameters in the map, `linearized` a function for these two alone.
-    """
-    linearized = linearized or (linearize_in_plane if len(mount) == 3 else linearize_in_space)
-    vary_at = 0 if varied is None else address_of(varied, VARY)
-    return (
-        address_of(linearized, LINEARIZE),
-        address_of(look, LOOK),
-        address_of(expect, EXPECT),
-        code,
-        mount,
-        par,
-        angular,
-        vary_at,
-    )
+    def _view(self, r: Array, s: Array, behind: Array, l: Array, given: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the view v (K, d), V_r, V_s or, of a moving sensor, that in the block behind the pose, and V_l."""
+        if self.landmark is None:
+            of_state = sees_state(self.sensor, self.motion)
+            since = given[0] if of_state else given[0, -1:]
+            v, V_r, V_s, V_l = seen(self.sensor.views, of_state, self.motion, r, s, l[0], since)
+            return v[None], V_r[None], V_s[None], V_l[None]
+        T, T_r, T_s = sensor_pose(r, s)
+        v, V_T, V_l = self.landmark.seen_from(T, given if given.shape[1] else l)
+        if not self.moving:
+            return v, V_T @ T_r, V_T @ T_s, V_l
+        t, t_r, t_x = (
+            np.tile(part, (len(v), *[1] * part.ndim)) for part in velocity_of(self.motion, s, r, behind, self.since)
+        )
+        V_r, V_x = np.concatenate([V_T @ T_r, t_r], axis=1), np.concatenate([0 * t_x, t_x], axis=1)
+        return np.concatenate([v, t], axis=1), V_r, V_x, np.concatenate([V_l, 0 * V_l], axis=1)
 
 
 def is_built_in(sensor: Any, landmark: Any) -> bool:
     """Return whether both are kalmark's own, and no user's subclass of them."""
     known = type(landmark.ray if isinstance(landmark, landmarks.AsPoint) else landmark) in landmarks.BUILT_IN
-    return known and type(sensor) in sensors.BUILT_IN
+    return (landmark is None or known) and type(sensor) in sensors.BUILT_IN
 
 
-def view_of(sensor: Any, landmark: Any, mount: Array) -> Any:
-    """Return the argument of `linearize`, a `View` of compiled models or a `PythonView`; `mount` (3,) or (7,)."""
+def view_of(sensor: Any, landmark: Any, mount: Array, motion: Any = None, since: Array = NOTHING) -> Any:
+    """Return the argument of `linearize`, a `View` of compiled models or a `PythonView`; `mount` (3,) or (7,).
+
+    Without a landmark it is that of a sensor of the state of a robot with this `motion`.  For a sensor of landmarks
+    that sees its own velocity `since` (1 + k,) is read at each scan: the seconds since the last one, which count where
+    the motion has no velocity in its state, and the control in force where that has the turn rate.
+    """
     angular = np.array(sensor.angular, dtype=np.bool_)
-    if is_built_in(sensor, landmark):
-        par = np.array(sensor.constants, dtype=np.float64)
-        varied = None if parameter_covariance(sensor) is None else type(sensor).varied
-        plain = type(sensor) is sensors.RangeBearing and type(landmark) is landmarks.Point2D and varied is None
-        models = landmark.look, type(sensor).expected, int(sensor.code)
-        return built_in_view(*models, mount, par, angular, varied, linearize_ranges if plain else None)
-    return PythonView(sensor, landmark, mount, angular)
+    links, chains, of_state = links_of(sensor, landmark, motion)
+    if not is_built_in(sensor, landmark) or (of_state and type(motion) not in built_in("motion")):
+        return PythonView(sensor, landmark, mount, angular, motion, since)
+    known, numbers = parameter_covariance(sensor) is None, sensor.constants if landmark else sensor.parameters
+    plain = known and type(sensor) is sensors.RangeBearing and type(landmark) is landmarks.Point2D
+    return (
+        address_of(linearize_ranges if plain else linearize_chain, LINEARIZE),
+        _address(None if plain else links, LINKS),
+        address_of(COMPOSES[len(mount)], COMPOSE),
+        _address(chains and chains[len(mount) != 3], CHAIN),
+        _address(landmark and landmark.look, LOOK),
+        _address(type(sensor).expected, EXPECT),
+        _address(None if known else type(sensor).varied, VARY),
+        _address(type(motion).velocity if of_state else None, VELOCITY),
+        int(sensor.code),
+        mount,
+        since if landmark and chains else np.array(numbers, dtype=np.float64),
+        angular,
+    )
+
+
+def links_of(sensor: Any, landmark: Any, motion: Any) -> tuple[Any, Any, bool]:
+    """Return the links of a sensor, its chains in plane and space, and whether they are of its robot's state.
+
+    A sensor that sees nothing but landmarks has no chains: None.
+    """
+    if landmark is None:
+        of_state = sees_state(sensor, motion)
+        return links_of_state, CHAINS[sensor.views, of_state], of_state
+    if not isinstance(sensor, SeesVelocity):
+        return links_of_landmarks, None, False
+    of_state = tells_velocity(motion)
+    return links_of_moving, CHAINS[TWIST, of_state], of_state
+
+
+def _address(function: Any, signature: Any) -> int:
+    """Return the address of a function, 0 for none."""
+    return 0 if function is None else address_of(function, signature)
 
 
 def linearize(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -194,85 +245,62 @@ def _compiled_linearize(view: Any, head: Any, l: Any, y: Any) -> Any:
 
 def sensor_at(view: Any, head: Array, address: int) -> tuple[Array, Array]:
     """Return the position (2 or 3,) of the sensor of a view, and its Jacobian in the head, by `sensor_address`."""
-    return call_sensor_at(address, (view[MOUNT] if isinstance(view, tuple) else view.mount, head))
+    if isinstance(view, tuple):
+        return call_sensor_at(address, (view[2], view[MOUNT], is_moving(view), head))
+    moving = isinstance(view, PythonView) and view.moving
+    return call_sensor_at(address, (address_of(COMPOSES[len(view.mount)], COMPOSE), view.mount, int(moving), head))
 
 
 @overload(sensor_at, strict=False)  # type: ignore[untyped-decorator]
 def _compiled_sensor_at(view: Any, head: Any, address: Any) -> Any:
-    return lambda view, head, address: call_sensor_at(address, (view[MOUNT], head))
+    return lambda view, head, address: call_sensor_at(address, (view[2], view[MOUNT], is_moving(view), head))
 
 
-def sensor_address(axes: int) -> int:
-    """Return the address of what `sensor_at` calls in the plane (one axis) or in space."""
-    return address_of(_sensor_in_plane if axes == 1 else _sensor_in_space, SENSOR_AT)
+def sensor_address() -> int:
+    """Return the address of what `sensor_at` calls."""
+    return address_of(place_of_sensor, SENSOR_AT)
 
 
 @compiled
-def _sensor_in_plane(mount: Array, head: Array) -> tuple[Array, Array]:
-    """Return the position S (2,) of a mount on a robot, and S_h (2, h); h is the pose and, if in the map, the mount.
+def place_of_sensor(compose_at: int, at: Array, moving: int, head: Array) -> tuple[Array, Array]:
+    """Return the position S (2 or 3,) of a sensor whose mount is `at` or in the head (h,), and S_h (2 or 3, h).
 
-    Of a mount with a mark behind it (`velocity_view.py`) h is the pose and a state that it does not depend on.
+    It does not depend on a block of the head that tells the velocity of a `moving` one.
     """
-    marked = len(mount) > 3
-    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 and not marked else mount[:3])
-    S, S_h = _position(T, T_r, T_s, 2, len(head))
-    if marked:
-        S_h[:, 3:] = 0.0
-    return S, S_h
-
-
-@compiled
-def _sensor_in_space(mount: Array, head: Array) -> tuple[Array, Array]:
-    """Return the position S (3,) of a mount on a robot, and S_h (3, h); h is the pose and, if in the map, the mount.
-
-    Of a mount with a mark behind it (`velocity_view.py`) h is the pose and a state that it does not depend on.
-    """
-    marked = len(mount) > 7
-    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 and not marked else mount[:7])
-    S, S_h = _position(T, T_r, T_s, 3, len(head))
-    if marked:
-        S_h[:, 6:] = 0.0
-    return S, S_h
-
-
-@compiled
-def _position(T: Array, T_r: Array, T_s: Array, size: int, head: int) -> tuple[Array, Array]:
-    pose, dof = len(T), len(T_r)
-    S_h = np.zeros((size, dof if head == pose else 2 * dof + head - 2 * pose))
-    for i in range(size):
+    pose, mounted = len(at), len(head) > len(at) and moving == 0
+    T, T_r, T_s = call_compose(compose_at, (head[:pose], head[pose : 2 * pose] if mounted else at))
+    d, dof = 2 if pose == 3 else 3, len(T_r)
+    S_h = np.zeros((d, dof if len(head) == pose else 2 * dof + len(head) - 2 * pose))
+    for i in range(d):
         for j in range(dof):
             S_h[i, j] = T_r[i, j]
-            if head > pose:
+            if mounted:
                 S_h[i, dof + j] = T_s[i, j]
-    return T[:size].copy(), S_h
+    return T[:d].copy(), S_h
 
 
 @compiled
-def linearize_in_plane(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what `expectation` returns in the plane, compiled.
-
-    The landmarks l are (K, n), the measurements y (K, m); e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n).
-    """
-    mount = view[4]
-    T, T_r, T_s = compose(head[:3], head[3:6] if len(head) > 3 else mount)
-    return _linearized(view, head, T, T_r, T_s, l, y)
+def is_moving(view: View) -> int:
+    """Return 1 if what is behind the robot's pose in the head tells the sensor's velocity, 0 if it is a mount."""
+    return 1 if view[3] != 0 and view[4] != 0 else 0
 
 
 @compiled
 def linearize_ranges(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what `linearize_in_plane` does of ranges and bearings of points l (K, 2), its chain rule worked out.
+    """Return what `linearize_chain` does of ranges and bearings of points l (K, 2), its chain rule worked out.
 
     The points stand at d from the sensor, in the axes of the map.  [S] (56), (61).
     """
-    gain, offset = view[5]
-    s = head[3:6] if len(head) > 3 else view[4]
+    at, (gain, offset) = view[MOUNT], view[10]
+    s = head[3:6] if len(head) > 3 else at
     cos, sin = math.cos(head[2]), math.sin(head[2])
     b_x, b_y = cos * s[0] - sin * s[1], sin * s[0] + cos * s[1]  # from the robot to the sensor
     c_T, s_T = math.cos(head[2] + s[2]), math.sin(head[2] + s[2])
-    k = len(l)
-    e, z, E_h, E_l = np.empty((k, 2)), np.empty((k, 2)), np.empty((k, 2, len(head))), np.empty((k, 2, 2))
+    k, known = len(y), y.shape[1] > 2
+    e, z, E_h, E_l = y.copy(), np.empty((k, 2)), np.empty((k, 2, len(head))), np.empty((k, 2, 2))
     for i in range(k):
-        d_x, d_y = l[i, 0] - (head[0] + b_x), l[i, 1] - (head[1] + b_y)
+        x_l, y_l = (y[i, 2], y[i, 3]) if known else (l[i, 0], l[i, 1])
+        d_x, d_y = x_l - (head[0] + b_x), y_l - (head[1] + b_y)
         d2 = d_x * d_x + d_y * d_y
         d = math.sqrt(d2)
         e[i, 0], e[i, 1] = (d + offset) / gain, math.atan2(c_T * d_y - s_T * d_x, c_T * d_x + s_T * d_y)
@@ -288,51 +316,126 @@ def linearize_ranges(view: View, head: Array, l: Array, y: Array) -> tuple[Array
             )  # a turn is one of bearings
             if len(head) > 3:
                 E_h[i, a, 3], E_h[i, a, 4], E_h[i, a, 5] = -E_x * cos - E_y * sin, E_x * sin - E_y * cos, -a
-    return e, z, E_h, E_l
+    return e, z, E_h, np.empty((k, 2, 0)) if known else E_l
 
 
 @compiled
-def linearize_in_space(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what `expectation` returns in space, compiled.
+def linearize_chain(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
+    """Return e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n) of landmarks l (K, n) and measurements y (K, m).
 
-    The landmarks l are (K, n), the measurements y (K, m); e (K, m), z (K, p), E_h (K, p, h) and E_l (K, p, n).
+    A block that is given behind the measurements, in y, is so in e.  E_h = E_v V_T T_h, and E_l = E_v V_l.
     """
-    mount = view[4]
-    T, T_r, T_s = frames3d.compose(head[:7], head[7:14] if len(head) > 7 else mount)
-    return _linearized(view, head, T, T_r, T_s, l, y)
+    _, links_at, _, _, look_at, expect_at, vary_at, velocity_at, code, at, par, angular = view
+    own = head[2 * len(at) if vary_at != 0 else len(head) :]
+    measured, given = split_columns(y, len(angular))
+    v, V_T, T_h, V_l = call_links(links_at, (view, head, l, given))
+    par = with_first(par, own)
+    e, z, E_v = landmark_views.expect(expect_at, (code, par, angular, v, measured))
+    E_h = multiply_by_one(multiply_many(E_v, V_T), T_h, len(own))
+    if len(own) > 0:  # of a sensor of the state they are taken at the mean of earlier readings, where that is given
+        usual = look_at == 0 and velocity_at == 0 and given.shape[1] > 1
+        at_e = split_columns(given, e.shape[1])[0] if usual else e
+        write_last_columns(E_h, landmark_views.vary(vary_at, (code, par, angular, v, at_e)))
+    return append_columns(e, given), z, E_h, multiply_many(E_v, V_l)
 
 
 @compiled
-def _linearized(
-    view: View, head: Array, T: Array, T_r: Array, T_s: Array, l: Array, y: Array
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
-    """Apply the chain rule from the sensor's pose T on, T_r and T_s being its Jacobians."""
-    _, look_at, expect_at, code, at, par, angular, vary_at = view
+def links_of_landmarks(view: View, head: Array, l: Array, given: Array) -> Links:
+    """Return the view v (K, d) of landmarks l (K, n) or `given`, V_T, T_h of the sensor's pose T, and V_l.
+
+    V_l has no columns for what is given.
+    """
+    at, known = view[MOUNT], given.shape[1] > 0
+    pose, mounted = len(at), len(head) > len(at)
+    T, T_r, T_s = call_compose(view[2], (head[:pose], head[pose : 2 * pose] if mounted else at))
+    v, V_T, V_l = landmark_views.look(view[4], (T, given if known else l))
+    return v, V_T, append_columns(T_r, T_s) if mounted else T_r, np.empty((len(v), V_l.shape[1], 0)) if known else V_l
+
+
+@compiled
+def links_of_moving(view: View, head: Array, l: Array, given: Array) -> Links:
+    """Return the views (K, 2 d) of landmarks with the velocity t of their sensor behind each, V_T, T_h and V_l.
+
+    What is between is the sensor's pose T and t, which depends on the block behind the robot's pose in the head.
+    """
+    at = view[MOUNT]
     pose = len(at)
-    if len(head) > 2 * pose:
-        par = par.copy()
-        for i in range(len(head) - 2 * pose):
-            par[i] = head[2 * pose + i]
-    v, V_T, V_l = landmark_views.look(look_at, (T, l))
-    e, z, E_v = landmark_views.expect(expect_at, (code, par, angular, v, y))
-    E_T, E_l = multiply_many(E_v, V_T), multiply_many(E_v, V_l)
-    if len(head) == pose:
-        return e, z, turn_jacobian(E_T, T_r), E_l
-    k, p, n = E_T.shape
-    E_h = np.zeros((k, p, 2 * n + len(head) - 2 * pose))
+    p, P_T, T_r, V_l = links_of_landmarks(view, head[:pose], l, given)
+    t, t_r, _, t_x = call_chain(view[3], (head[:pose], at, head[pose:], view[10], view[7]))
+    k, d = p.shape
+    n, others = T_r.shape[1], t_x.shape[1]
+    v, V_T, T_h = np.empty((k, 2 * d)), np.zeros((k, 2 * d, n + d)), np.zeros((n + d, n + others))
+    v[:, :d], v[:, d:] = p, t[:d]
+    V_T[:, :d, :n] = P_T
+    for j in range(d):
+        V_T[:, d + j, n + j] = 1.0
+    T_h[:n, :n], T_h[n:, :n], T_h[n:, n:] = T_r, t_r[:d], t_x[:d]
+    return v, V_T, T_h, V_l
+
+
+@compiled
+def links_of_state(view: View, head: Array, l: Array, given: Array) -> Links:
+    """Return the view v (1, d) of a robot and its second block l (1, n), the identity, V_h, and V_l."""
+    at, velocity_at = view[MOUNT], view[7]
+    pose, mounted = len(at), len(head) > len(at)
+    first = 0 if velocity_at != 0 else max(0, given.shape[1] - 1)  # behind the mean of earlier readings, if given
+    s = head[pose : 2 * pose] if mounted else at
+    v, V_r, V_s, V_l = call_chain(view[3], (head[:pose], s, l[0], given[0, first:], velocity_at))
+    V_h = append_columns(V_r, V_s) if mounted else V_r
+    n = len(V_r)
+    return v.reshape((1, len(v))), np.eye(n).reshape((1, n, n)), V_h, V_l.reshape((1, n, V_l.shape[1]))
+
+
+@compiled
+def split_columns(y: Array, m: int) -> tuple[Array, Array]:
+    """Return the first m columns of y (K, m + n) and the others."""
+    k, size = y.shape
+    if size == m:
+        return y, np.empty((k, 0))
+    first, others = np.empty((k, m)), np.empty((k, size - m))
     for i in range(k):
-        for a in range(p):
-            for b in range(n):
-                for c in range(n):
-                    E_h[i, a, n + c] += E_T[i, a, b] * T_s[b, c]
-    turn_jacobian(E_T, T_r)
+        for j in range(size):
+            if j < m:
+                first[i, j] = y[i, j]
+            else:
+                others[i, j - m] = y[i, j]
+    return first, others
+
+
+@compiled
+def with_first(a: Array, first: Array) -> Array:
+    """Return numbers a (n,), the first of them replaced by `first`."""
+    if len(first) == 0:
+        return a
+    out = a.copy()
+    for i in range(len(first)):
+        out[i] = first[i]
+    return out
+
+
+@compiled
+def append_columns(a: Array, b: Array) -> Array:
+    """Return the columns of a (K, m) and behind them those of b (K, n)."""
+    k, m = a.shape
+    if b.shape[1] == 0:
+        return a
+    out = np.empty((k, m + b.shape[1]))
     for i in range(k):
-        for a in range(p):
-            for c in range(n):
-                E_h[i, a, c] = E_T[i, a, c]
-    if len(head) > 2 * pose:
-        write_last_columns(E_h, landmark_views.vary(vary_at, (code, par, angular, v, e)))
-    return e, z, E_h, E_l
+        for j in range(out.shape[1]):
+            out[i, j] = a[i, j] if j < m else b[i, j - m]
+    return out
+
+
+@compiled
+def multiply_by_one(E: Array, F: Array, more: int) -> Array:
+    """Return the products E F (K, p, h) of E (K, p, n) with one F (n, h), with so many `more` columns of 0 behind."""
+    out = np.zeros((len(E), E.shape[1], F.shape[1] + more))
+    for i in range(len(E)):
+        for a in range(E.shape[1]):
+            for b in range(F.shape[0]):
+                for c in range(F.shape[1]):
+                    out[i, a, c] += E[i, a, b] * F[b, c]
+    return out
 
 
 @compiled
@@ -343,19 +446,6 @@ def write_last_columns(E_h: Array, E_p: Array) -> None:
         for a in range(p):
             for b in range(c):
                 E_h[i, a, E_h.shape[2] - c + b] = E_p[i, a, b]
-
-
-@compiled
-def turn_jacobian(E_T: Array, T_r: Array) -> Array:
-    """Return E_T @ T_r (K, m, n) in place: T_r is the identity except for the rotation of the robot."""
-    k, m, n = E_T.shape
-    first = 2 if n == 3 else 3
-    for i in range(k):
-        for a in range(m):
-            for c in range(first, n):
-                for b in range(first):
-                    E_T[i, a, c] += E_T[i, a, b] * T_r[b, c]
-    return E_T
 
 
 # ------------------------------------------------------------------ motions

@@ -13,7 +13,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
-from kalmark.declare import Estimated, Limit, NotNegative, Number, Positive, declared, refuse, register
+from kalmark.declare import Estimated, NotNegative, Number, Positive, declared, refuse, register
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
 from kalmark.models import landmark_views
@@ -21,7 +21,7 @@ from kalmark.models.landmark_views import Cone, Distancing, Expecting, Raised, r
 
 __all__ = ["Bearing", "Position2D", "Range", "Range3D", "RangeBearing", "RangeBearingSignature"]
 
-RANGE_BEARING, BEARING, POSITION, RANGE_BEARING_SIGNATURE = range(1, 5)  # codes of the sensors
+RANGE_BEARING, BEARING, RANGE_BEARING_SIGNATURE = range(1, 4)  # codes of the sensors
 BearingNoise = Annotated[Positive, "Noise of the bearing."]
 
 
@@ -29,12 +29,6 @@ BearingNoise = Annotated[Positive, "Noise of the bearing."]
 def measured_in_plane(code: int, v: Array) -> tuple[Array, Array]:
     """Return the measurements (K, m) that the built-in sensor `code` makes of v (K, d), and E_v (K, m, d)."""
     k, d = v.shape
-    if code == POSITION:
-        e, E_v = np.empty((k, 2)), np.zeros((k, 2, d))
-        for i in range(k):
-            e[i, 0], e[i, 1] = v[i, 0], v[i, 1]
-            E_v[i, 0, 0] = E_v[i, 1, 1] = 1.0
-        return e, E_v
     y, Y_p = scan_many(v)
     first = 1 if code == BEARING else 0
     m = 2 - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
@@ -85,24 +79,13 @@ def by_gain_and_offset(code: int, par: Array, angular: Flags, v: Array, e: Array
     return E_p
 
 
-@declared
-class _Planar(Expecting):
+class _Planar(Cone):
     """Base of the planar sensors: limits of range, built-in expectation."""
-
-    _: KW_ONLY
-    range_min_m: Annotated[NotNegative, "Nearest landmark that is measured."] = 0.0
-    range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
-    fov_rad: Annotated[Positive, "Field of view, centred forward."] = 2 * math.pi
 
     world = "plane"
     expected = in_plane
     code: ClassVar[int]
-
-    def sees(self, v: Array) -> Flags:
-        """Return which of v (K, d) lie within the sensor's range limits and field of view."""
-        distance, bearing = np.hypot(v[:, 0], v[:, 1]), np.abs(np.arctan2(v[:, 1], v[:, 0]))
-        inside: Flags = (self.range_min_m <= distance) & (distance <= self.range_max_m)
-        return inside & (bearing <= self.fov_rad / 2)
+    point_size = 2
 
 
 @declared
@@ -146,11 +129,6 @@ class _Ranging(Expecting):
         """Return the sensor with another gain and offset (2,)."""
         gain, offset = parameters.tolist()
         return replace(self, scale=1.0 / gain, bias_m=offset / gain)
-
-    def parameters_jacobian(self, v: Array) -> Array:
-        """Return E_p (K, m, 2): how the measurements of v (K, d) change with gain and offset."""
-        e, nothing = self.expect(v)[0], np.zeros(1, dtype=np.bool_)
-        return np.asarray(by_gain_and_offset(0, self.parameters, nothing, v, e))
 
     def distances(self, y: Array) -> Array:
         """Return the distances (K,) that measurements y (K, m) stand for."""
@@ -312,7 +290,8 @@ class Position2D(_Planar):
     sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1
     sigma_y_m: Annotated[Positive, "Noise, to the left."] = 0.1
 
-    code = POSITION
+    code = 0
+    expected = landmark_views.components
     columns = ("x_m", "y_m")
     sigmas = ("sigma_x_m", "sigma_y_m")
 

@@ -3,7 +3,7 @@
 N + M, not N x M: a sensor measures a point in its own frame only.  Models are batched: K landmarks at once, values (K,
 d), Jacobians (K, m, d).  `pointwise` lifts one-point functions.
 
-A capability is optional.  One with a default is read by the function of its name, as in `finds_depth(sensor)`; one that
+A capability is optional.  One with a default is read by a function, as in `finds_depth(sensor)`; one that
 decides what is done with a model is a Protocol, as in `isinstance(sensor, Visible)`.
 """
 
@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import difflib
 import math
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
@@ -26,6 +27,7 @@ __all__ = [
     "Reparametrizable", "SeesVelocity", "SegmentVisible", "Segmented", "SelfCalibrating", "Sensor", "StartNoise",
     "StateDiffusion", "TimedNoise", "UnknownDepth", "Visible",
 ]  # fmt: skip
+T = TypeVar("T")
 _FOUND: dict[tuple[type, type, tuple[str, ...]], bool] = {}
 
 
@@ -178,44 +180,41 @@ class Landmark(Capability, Protocol):
 
 
 # ------------------------------------------------------------------ capabilities with a default
-@runtime_checkable
-class _FindsDepth(Capability, Protocol):
-    finds_depth: bool
+def optional(name: str, default: T) -> Callable[[object], T]:
+    """Return the function that reads an optional attribute of a model, which is `default` where it has none.
+
+    >>> optional("finds_depth", True)(km.sensors.Bearing()), optional("finds_depth", True)(km.sensors.RangeBearing())
+    (False, True)
+    """
+    OPTIONAL.add(name)
+
+    def read(model: object) -> T:
+        return getattr(model, name, default)
+
+    return read
 
 
-@runtime_checkable
-class _OfPair(Capability, Protocol):
-    of_pair: bool
-
-
-@runtime_checkable
-class _SeesKinds(Capability, Protocol):
-    sees_kinds: tuple[str, ...]
-
-
-@runtime_checkable
-class _OfWorld(Capability, Protocol):
-    world: str
-
-
-@runtime_checkable
-class _Image(Capability, Protocol):
-    image: tuple[float, float]
-
-
-@runtime_checkable
-class _RangeLimit(Capability, Protocol):
-    range_max_m: float
-
-
-@runtime_checkable
-class _FieldOfView(Capability, Protocol):
-    fov_rad: float
-
-
-@runtime_checkable
-class _Coasts(Capability, Protocol):
-    coasts: bool
+OPTIONAL = {"cov_size", "keep", "parameter_names"}
+finds_depth = optional("finds_depth", True)
+"""Whether one measurement determines how far the landmark is."""
+has_second_camera = optional("of_pair", False)
+"""Whether a frame of the sensor has the image of a second camera, to the right."""
+sees_kinds = optional("sees_kinds", cast("tuple[str, ...] | None", None))
+"""The kinds of landmarks that a sensor measures, None for any that fits."""
+world_of = optional("world", "")
+""""plane" or "space", "" for a model of either."""
+image_size = optional("image", cast("tuple[float, float] | None", None))
+"""The width and height of a sensor's image, px; None: it has none."""
+range_limit = optional("range_max_m", math.inf)
+"""The distance of the farthest landmark that a sensor measures, m."""
+field_of_view = optional("fov_rad", 2 * math.pi)
+"""A sensor's field of view about its x axis, rad."""
+coasts = optional("coasts", False)
+"""Whether a robot moves without a control, as its state has a velocity."""
+state_columns = optional("state_columns", cast("tuple[str, ...]", ()))
+"""The names, with units, of a state's components behind the pose."""
+sees_rates = optional("sees_rates", False)
+"""Whether a sensor of a twist measures turn rates."""
 
 
 @runtime_checkable
@@ -265,11 +264,6 @@ class StateDiffusion(Capability, Protocol):
 
 
 @runtime_checkable
-class _StateColumns(Capability, Protocol):
-    state_columns: tuple[str, ...]
-
-
-@runtime_checkable
 class HasVelocity(Capability, Protocol):
     """A motion whose state contains the velocity of the robot.
 
@@ -312,66 +306,6 @@ def velocity_in(motion: Any, r: Array, u: Array) -> tuple[Array, Array]:
     return velocity
 
 
-@runtime_checkable
-class _SeesRates(Capability, Protocol):
-    sees_rates: bool
-
-
-def sees_rates(sensor: object) -> bool:
-    """Return whether a sensor of a twist measures turn rates; by default it does not."""
-    return sensor.sees_rates if isinstance(sensor, _SeesRates) else False
-
-
-@runtime_checkable
-class _NamesParameters(Capability, Protocol):
-    parameter_names: tuple[str, ...]
-
-
-@runtime_checkable
-class _InnovationSize(Capability, Protocol):
-    cov_size: int
-
-
-def finds_depth(sensor: object) -> bool:
-    """Return whether one measurement determines how far the landmark is; by default it does."""
-    return sensor.finds_depth if isinstance(sensor, _FindsDepth) else True
-
-
-def has_second_camera(sensor: object) -> bool:
-    """Return whether a frame of the sensor has the image of a second camera, to the right; by default not."""
-    return sensor.of_pair if isinstance(sensor, _OfPair) else False
-
-
-def sees_kinds(sensor: object) -> tuple[str, ...] | None:
-    """Return the kinds of landmarks that a sensor measures; by default None: any that fits."""
-    return sensor.sees_kinds if isinstance(sensor, _SeesKinds) else None
-
-
-def world_of(model: object) -> str:
-    """Return "plane" or "space"; by default "": a model of either."""
-    return model.world if isinstance(model, _OfWorld) else ""
-
-
-def image_size(sensor: object) -> tuple[float, float] | None:
-    """Return the width and height of a sensor's image, px; by default None: it has none."""
-    return sensor.image if isinstance(sensor, _Image) else None
-
-
-def range_limit(sensor: object) -> float:
-    """Return the distance of the farthest landmark that a sensor measures, m; by default infinity."""
-    return sensor.range_max_m if isinstance(sensor, _RangeLimit) else math.inf
-
-
-def field_of_view(sensor: object) -> float:
-    """Return a sensor's field of view about its x axis, rad; by default 2 pi."""
-    return sensor.fov_rad if isinstance(sensor, _FieldOfView) else 2 * math.pi
-
-
-def coasts(motion: object) -> bool:
-    """Return whether a robot moves without a control, as its state has a velocity; by default it does not."""
-    return motion.coasts if isinstance(motion, _Coasts) else False
-
-
 def self_calibrating(motion: object) -> SelfCalibrating | None:
     """Return a motion of which constants are in the map; by default None: it has none."""
     return motion if isinstance(motion, SelfCalibrating) and motion.calibration else None
@@ -390,11 +324,6 @@ def diffusion_of(motion: Motion, r: Array, u: Array, dt_s: float) -> Array | Non
     return motion.diffusion_at(r, u, dt_s) if isinstance(motion, StateDiffusion) else motion.diffusion(u, dt_s)
 
 
-def state_columns(motion: object) -> tuple[str, ...]:
-    """Return the names, with units, of a state's components behind the pose; by default it has none."""
-    return motion.state_columns if isinstance(motion, _StateColumns) else ()
-
-
 def parameter_covariance(sensor: object) -> Array | None:
     """Return the covariance (p, p) of a sensor's own parameters; by default None: they are known."""
     return sensor.parameter_cov if isinstance(sensor, Calibrated) else None
@@ -402,10 +331,9 @@ def parameter_covariance(sensor: object) -> Array | None:
 
 def parameter_names(sensor: object) -> tuple[str, ...]:
     """Return the names of a sensor's own parameters that are in the map; by default numbers."""
-    if isinstance(sensor, _NamesParameters):
-        return sensor.parameter_names
     cov = parameter_covariance(sensor)
-    return () if cov is None else tuple(f"constant {k}" for k in range(1, len(cov) + 1))
+    numbers = tuple(f"constant {k}" for k in range(1, 1 + (0 if cov is None else len(cov))))
+    return getattr(sensor, "parameter_names", numbers)
 
 
 def innovation_size(sensor: Sensor) -> int:
@@ -477,7 +405,7 @@ class Calibrated(Parametrized, Protocol):
 class SeesVelocity(Capability, Protocol):
     """A sensor of landmarks that stand still, whose measurements depend on its own velocity, too.
 
-    Its v (K, 2 d) are points and, behind them, the velocity of the sensor, both in its frame (`velocity_view.py`).
+    Its v (K, 2 d) are points and, behind them, the velocity of the sensor, both in its frame (`observe.py`).
 
     >>> isinstance(km.sensors.Radar2D(), SeesVelocity), isinstance(km.sensors.RangeBearing(), SeesVelocity)
     (True, False)
@@ -502,14 +430,9 @@ class OfState(Sensor, Protocol):
     """The share of good readings that pass its gate."""
 
 
-@runtime_checkable
-class _Keeps(Capability, Protocol):
-    keep: int
-
-
 def poses_kept(sensor: OfState) -> int:
     """Return of how many of its last scans a sensor of a change keeps the poses; by default of the last one."""
-    return sensor.keep if isinstance(sensor, _Keeps) and sensor.views == CHANGE else 1
+    return getattr(sensor, "keep", 1) if sensor.views == CHANGE else 1
 
 
 @runtime_checkable
@@ -732,8 +655,8 @@ class Joining(Segmented, Protocol):
 class HasPlace(Capability, Protocol):
     """A landmark that is somewhere.
 
-    >>> km.landmarks.Point2D().place(np.array([[1.0, 2.0]]))[0]
-    array([[1., 2.]])
+    >>> km.landmarks.Polar2D().place(np.array([[1.0, 2.0, 0.0, 3.0]]))[0]
+    array([[4., 2.]])
     """
 
     def place(self, l: Array) -> tuple[Array, Array]:
@@ -757,15 +680,12 @@ def place_of(landmark: Landmark, l: Array) -> tuple[Array, Array] | None:
 
 # ------------------------------------------------------------------ spelling
 _OF: dict[type, tuple[type, ...]] = {
-    Motion: (
-        Motion, _OfWorld, _Coasts, NonlinearCalibration, StateDiffusion, _StateColumns, HasVelocity,
-    ),
+    Motion: (Motion, NonlinearCalibration, StateDiffusion, HasVelocity),
     Sensor: (
-        FullSensor, NonAdditiveSensor, _OfWorld, _FindsDepth, _OfPair, _SeesKinds, _Image, _RangeLimit, _FieldOfView,
-        _InnovationSize, _NamesParameters, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous,
+        FullSensor, NonAdditiveSensor, Visible, SegmentVisible, Calibrated, Ranging, Intersecting, Ambiguous,
         FarCorrected, OwnNoise, StartNoise, Checked, SeesVelocity, OfState, TimedNoise, Drifting,
     ),
-    Landmark: (Landmark, _OfWorld, UnknownDepth, Completing, Reparametrizable, Segmented, Joining, HasPlace),
+    Landmark: (Landmark, UnknownDepth, Completing, Reparametrizable, Segmented, Joining, HasPlace),
 }  # fmt: skip
 _NEAR = 0.85  # of difflib: "see" is near "sees", "extent" is not near "extend"
 
@@ -780,7 +700,7 @@ def refuse_misspelt_names(model: object, what: str) -> None:
         return
     given = set(dir(model))
     parts = [part for role, all_of_it in _OF.items() if isinstance(model, role) for part in all_of_it]
-    known = {name for part in parts for name in _members(part)}
+    known = {name for part in parts for name in _members(part)} | OPTIONAL
     inherited = {name for cls in type(model).__mro__ if cls not in own for name in dir(cls)}
     for name in sorted(given - known - inherited):
         near = [] if name.startswith("_") else difflib.get_close_matches(name, known - given, n=1, cutoff=_NEAR)

@@ -112,11 +112,6 @@ class _SignalStrength(_Receiver):
         at_1_m, exponent = np.asarray(parameters).tolist()
         return replace(self, strength_dbm=at_1_m, exponent=exponent)
 
-    def parameters_jacobian(self, v: Array) -> Array:
-        """Return E_p (K, 1, 2): how the strengths of v (K, d) change with strength at 1 m and exponent."""
-        e, nothing = self.expect(v)[0], np.zeros(1, dtype=np.bool_)
-        return np.asarray(by_path_loss(0, np.array(self.parameters), nothing, np.ascontiguousarray(v), e))
-
 
 @register("sensor", "signal_strength")
 class SignalStrength2D(_SignalStrength, Raised):

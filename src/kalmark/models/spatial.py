@@ -113,7 +113,7 @@ class Position3D(Cone, Spatial):
     sigma_y_m: Annotated[Positive, "Noise, along y."] = 0.1
     sigma_z_m: Annotated[Positive, "Noise, along z."] = 0.1
 
-    expected = landmark_views.position
+    expected = landmark_views.components
     columns = ("x_m", "y_m", "z_m")
     sigmas = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
 

@@ -20,7 +20,7 @@ from kalmark.declare import NotNegative, Number, Positive, Probability, Within, 
 from kalmark.events import unit_quaternion
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew, to_euler
 from kalmark.models import landmark_views
-from kalmark.models.landmark_views import Sensing, residual
+from kalmark.models.landmark_views import Sensing, components, residual
 from kalmark.models.protocols import CHANGE, POSE, TWIST
 
 __all__ = [
@@ -49,41 +49,6 @@ def heading(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[
 
 
 @compiled
-def place(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Expect the position of a pose v (1, 3) or (1, 7)."""
-    d = y.shape[1]
-    e, E_v = v[:, :d].copy(), np.zeros((1, d, 3 if v.shape[1] == 3 else 6))
-    for i in range(d):
-        E_v[0, i, i] = 1.0
-    return e, y - e, E_v
-
-
-@compiled
-def antenna(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Expect the position of a pose v (1, 3) or (1, 7), with the bias `par` (d,)."""
-    e, _z, E_v = place(code, par, angular, v, y)
-    for i in range(e.shape[1]):
-        e[0, i] += par[i]
-    return e, y - e, E_v
-
-
-@compiled
-def pose_in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Expect a pose v (1, 3) itself."""
-    E_v = np.zeros((1, 3, 3))
-    E_v[0] = np.eye(3)
-    return v.copy(), residual(y, v, angular), E_v
-
-
-@compiled
-def height(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Expect the height of a pose v (1, 7), with the bias `par`."""
-    e, E_v = np.array([[v[0, 2] + par[0]]]), np.zeros((1, 1, 6))
-    E_v[0, 0, 2] = 1.0
-    return e, y - e, E_v
-
-
-@compiled
 def inclination(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Expect roll and pitch of a pose v (1, 7)."""
     euler, E_q = to_euler(v[0, 3:].copy())
@@ -98,17 +63,6 @@ def gravity(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[
     R, up = matrix(v[0, 3:].copy()).T.copy(), np.array([0.0, 0.0, par[0]])
     e, E_v = (R @ up + par[1:]).reshape((1, 3)), np.zeros((1, 3, 6))
     E_v[0, :, 3:] = R @ skew(up)
-    return e, y - e, E_v
-
-
-@compiled
-def rates(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Expect the turn rates of a twist v (1, 3) or (1, 6), with their biases `par`."""
-    k = len(par)
-    e, E_v = np.empty((1, k)), np.zeros((1, k, v.shape[1]))
-    for i in range(k):
-        at = v.shape[1] - k + i
-        e[0, i], E_v[0, i, at] = v[0, at] + par[i], 1.0
     return e, y - e, E_v
 
 
@@ -222,7 +176,10 @@ class StateSensor(Sensing):
         y = np.zeros((len(v), len(self.columns))) if y is None else y
         par, angular = np.array(self.parameters), np.array(self.angular, dtype=np.bool_)
         of = type(self).expected
-        rows = [of(0, par, angular, np.ascontiguousarray(v[k : k + 1]), np.array(y[k : k + 1])) for k in range(len(v))]
+        rows = [
+            of(self.code, par, angular, np.ascontiguousarray(v[k : k + 1]), np.array(y[k : k + 1]))
+            for k in range(len(v))
+        ]
         return np.concatenate([e for e, _, _ in rows]), np.concatenate([E_v for _, _, E_v in rows])
 
     # ------------------------------------------------------------------ its constants
@@ -305,7 +262,7 @@ class _Gps(StateSensor):
     ] = 0.0
 
     views = POSE
-    expected = antenna
+    expected = components
     varied = add_constants
 
 
@@ -375,7 +332,7 @@ class AbsolutePose2D(StateSensor):
     columns = ("x_m", "y_m", "theta_rad")
     sigmas = ("sigma_m", "sigma_m", "sigma_theta_rad")
     views = POSE
-    expected = pose_in_plane
+    expected = components
 
 
 @register("sensor", "absolute_pose")
@@ -429,7 +386,8 @@ class Height(StateSensor):
     columns = ("z_m",)
     sigmas = ("sigma_z_m",)
     views = POSE
-    expected = height
+    expected = components
+    code = 2
     varied = add_constants
     constants = (("bias_m", "sigma_bias_m", "sigma_bias_m_per_sqrt_s"),)
 
@@ -497,7 +455,7 @@ class _Gyro(StateSensor):
 
     views = TWIST
     sees_rates: ClassVar[bool] = True
-    expected = rates
+    expected = components
     varied = add_constants
 
     def __post_init__(self) -> None:
@@ -525,6 +483,7 @@ class Gyro2D(_Gyro):
     bias_radps: Bias = 0.0
 
     world = "plane"
+    code = 2
     columns = ("w_radps",)
     sigmas = ("sigma_radps",)
     constants = (("bias_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s"),)
@@ -547,6 +506,7 @@ class Gyro3D(_Gyro):
     bias_z_radps: Bias = 0.0
 
     world = "space"
+    code = 3
     columns = ("wx_radps", "wy_radps", "wz_radps")
     sigmas = ("sigma_radps",) * 3
     constants = tuple((f"bias_{axis}_radps", "sigma_bias_radps", "sigma_bias_radps_per_sqrt_s") for axis in "xyz")
@@ -670,7 +630,7 @@ class _ZeroVelocity(StateSensor):
 
     views = TWIST
     sees_rates: ClassVar[bool] = True
-    expected = place
+    expected = components
 
 
 @register("sensor", "zero_velocity")

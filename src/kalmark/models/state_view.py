@@ -16,28 +16,37 @@ since the sensor's last reading: of the constant twist that leads from there to 
 unit's state is joined by the turn rate of the control in force (`HoldsRate`), for sensors of velocities alone.  Behind
 the sensor's m numbers the filter's measurement has the time since the last reading in seconds, and that control.
 
-`Chain` functions have one form and are called by their addresses; `linearize_state` applies the chain rule from there
-on.  The corrections call it as they call any `observe.linearize`.
+`Chain` functions have one form and are called by their addresses; `models/observe.py` applies the chain rule from there
+on.  A sensor of landmarks that sees its own velocity, too, has the first part of the twist behind each landmark: its
+second block is the state or the clone, in the head where another sensor has its mount.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags
-from kalmark.compiled import address_of, by_address, compiled, signature_of
-from kalmark.declare import built_in
+from kalmark.arrays import Array
+from kalmark.compiled import by_address, compiled, signature_of
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.rotations import left_jacobian_inverse, left_jacobian_rate, log, matrix, skew
-from kalmark.models import landmark_views
-from kalmark.models.landmark_views import EXPECT, VARY, residual
-from kalmark.models.observe import LINEARIZE, VELOCITY, View, call_velocity
-from kalmark.models.protocols import CHANGE, POSE, TWIST, HasVelocity, HoldsRate, OfState, sees_rates, velocity_in
+from kalmark.models.protocols import (
+    CHANGE,
+    POSE,
+    TWIST,
+    HasVelocity,
+    HoldsRate,
+    OfState,
+    sees_rates,
+    tells_velocity,
+    velocity_in,
+)
 
+# of the state r (size,) and parameters: the velocity in the robot's frame b (3 or 6,) and B_r (3 or 6, dof)
+VELOCITY = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], f8[::1])")
+call_velocity = by_address(VELOCITY)
 # of robot, mount, second block, seconds since the last reading and control, address of a VELOCITY: v, V_r, V_s, V_l
 CHAIN = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8[::1], i8)")
 call_chain = by_address(CHAIN)
@@ -156,90 +165,16 @@ CHAINS: dict[tuple[str, bool], tuple[Any, Any]] = {  # by view, and whether it i
 }
 
 
-# ------------------------------------------------------------------ and what a sensor makes of it
-@compiled
-def linearize_state(view: View, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return e (1, .), z (1, p), E_h (1, p, h), E_l (1, p, n) of one reading y of a sensor of the state.
+def seen(views: str, of_state: bool, motion: Any, r: Array, s: Array, l: Array, since: Array) -> Chain:
+    """Return what a chain does, v, V_r, V_s and V_l, in Python: of a user's motion, too.
 
-    Like `observe.linearize`: the head is the robot's pose and, if in the map, the mount and the sensor's parameters.
-    y (1, m + 1) ends with the time since the last reading, and may have the control in force behind it where the
-    velocity is of the state.  Else in y (1, 2 m + 1) the mean of earlier readings comes before the time: the
-    parameters' Jacobian is taken there (docs/motions.md).
+    `since` (1 + k,): the seconds since the last reading and, where the velocity is of the state, the control in force.
     """
-    _, chain_at, expect_at, velocity, at, par, angular, vary_at = view
-    pose, m = len(at), len(angular)
-    mount = head[pose : 2 * pose].copy() if len(head) > pose else at
-    if len(head) > 2 * pose:
-        par = head[2 * pose :].copy()
-    since = y[0, m if velocity != 0 else y.shape[1] - 1 :].copy()
-    v, V_r, V_s, V_l = call_chain(chain_at, (head[:pose].copy(), mount, l[0].copy(), since, velocity))
-    row, e = v.reshape((1, len(v))), y.copy()
-    expected, z, E_v = landmark_views.expect(expect_at, (0, par, angular, row, y[:, :m].copy()))
-    e[:, :m] = expected
-    p, n = z.shape[1], V_r.shape[1]
-    E_h = np.zeros((1, p, n if len(head) == pose else 2 * n + len(head) - 2 * pose))
-    E_h[0, :, :n] = E_v[0] @ V_r
-    if len(head) > pose:
-        E_h[0, :, n : 2 * n] = E_v[0] @ V_s
-    if len(head) > 2 * pose:
-        usual = y[:, m : 2 * m].copy() if velocity == 0 and y.shape[1] > m + 1 else expected
-        E_h[0, :, 2 * n :] = landmark_views.vary(vary_at, (0, par, angular, row, usual))[0]
-    E_l = np.zeros((1, p, V_l.shape[1]))
-    if V_l.shape[1] > 0:
-        E_l[0] = E_v[0] @ V_l
-    return e, z, E_h, E_l
-
-
-@dataclass(frozen=True)
-class PythonStateView:
-    """A sensor of the state on its mount, evaluated in Python: `linearize_state` for a user's sensor or motion."""
-
-    sensor: Any
-    motion: Any
-    mount: Array
-    angular: Flags
-
-    def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """Return e (1, .), z (1, p), E_h (1, p, h) and E_l (1, p, n)."""
-        pose, m, sensor = len(self.mount), len(self.angular), self.sensor
-        mount = head[pose : 2 * pose] if len(head) > pose else self.mount
-        if len(head) > 2 * pose:
-            sensor = sensor.with_parameters(head[2 * pose :])
-        if sees_state(sensor, self.motion):
-            carried: Any = carried_in_plane if pose == 3 else carried_in_space
-            v, V_r, V_s, V_l = carried(*velocity_in(self.motion, l[0], y[0, m + 1 :]), np.array(mount))
-        else:
-            chain = CHAINS[sensor.views, False][pose != 3]
-            v, V_r, V_s, V_l = chain(head[:pose].copy(), np.array(mount), l[0].copy(), y[0, -1:].copy(), 0)
-        expected, E_v = sensor.expect(v[None])
-        e = y.copy()
-        e[:, :m] = expected
-        parts = [E_v @ V_r]
-        if len(head) > pose:
-            parts.append(E_v @ V_s)
-        if len(head) > 2 * pose:
-            parts.append(sensor.parameters_jacobian(v[None]))
-        return e, residual(y[:, :m].copy(), expected, self.angular), np.concatenate(parts, axis=2), E_v @ V_l
-
-
-def state_view_of(sensor: OfState, motion: Any, mount: Array) -> Any:
-    """Return the argument of `observe.linearize` for a sensor of the state on a mount, (3,) or (7,), of a robot."""
-    angular = np.array(sensor.angular, dtype=np.bool_)
-    of_state = sees_state(sensor, motion)
-    if type(sensor) not in built_in("sensor") or (of_state and type(motion) not in built_in("motion")):
-        return PythonStateView(sensor, motion, mount, angular)
-    of: Any = sensor
-    chain = CHAINS[of.views, of_state][len(mount) != 3]
-    return (
-        address_of(linearize_state, LINEARIZE),
-        address_of(chain, CHAIN),
-        address_of(type(of).expected, EXPECT),
-        address_of(type(motion).velocity, VELOCITY) if of_state else 0,
-        mount,
-        np.array(of.parameters, dtype=np.float64),
-        angular,
-        0 if of.parameter_cov is None else address_of(type(of).varied, VARY),
-    )
+    s, space = np.array(s), len(s) != 3
+    if of_state:
+        carried: Any = (carried_in_plane, carried_in_space)[space]
+        return carried(*velocity_in(motion, l, since[1:]), s)
+    return CHAINS[views, False][space](np.array(r), s, np.array(l), np.array(since), 0)
 
 
 def sees_state(sensor: OfState, motion: Any) -> bool:
@@ -253,9 +188,17 @@ def view_of_state(sensor: OfState, motion: Any, mount: Array, state: Array, befo
 
     `since` (1 + k,): the seconds since then, and the control in force.
     """
-    pose = len(mount)
-    if sees_state(sensor, motion):
-        carried: Any = carried_in_plane if pose == 3 else carried_in_space
-        v: Array = carried(*velocity_in(motion, state, since[1:]), mount)[0]
-        return v
-    return CHAINS[sensor.views, False][pose != 3](state[:pose].copy(), mount, before, since, 0)[0]
+    of_state = sees_state(sensor, motion)
+    second = state if of_state else before
+    return seen(sensor.views, of_state, motion, state[: len(mount)], mount, second, since)[0]
+
+
+def velocity_of(motion: Any, at: Array, r: Array, x: Array, since: Array) -> tuple[Array, Array, Array]:
+    """Return the velocity t (2 or 3,) of a sensor at `at`, in its frame, and its Jacobians t_r and t_x.
+
+    The robot's pose is r, and x its state if that has the velocity, else its pose since[0] seconds ago; the rest of
+    `since` is the control in force.
+    """
+    d = 2 if len(at) == 3 else 3
+    t, t_r, _, t_x = seen(TWIST, tells_velocity(motion), motion, r, at, x, since)
+    return t[:d], t_r[:d], t_x[:d]

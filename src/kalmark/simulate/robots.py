@@ -44,8 +44,7 @@ from kalmark.models.protocols import (
     true_control,
 )
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
-from kalmark.models.state_view import sees_state, view_of_state
-from kalmark.models.velocity_view import velocity_of
+from kalmark.models.state_view import sees_state, velocity_of, view_of_state
 from kalmark.simulate import laser, sights
 from kalmark.simulate.layouts import Scenery
 from kalmark.simulate.routes import Driver

@@ -16,8 +16,9 @@ from kalmark.filter.estimators import Estimator, Iterating, Update
 from kalmark.filter.map import Map
 from kalmark.geometry.gaussian import gate
 from kalmark.models import protocols
+from kalmark.models.observe import view_of
 from kalmark.models.protocols import CHANGE, POSE, HoldsRate, Motion, OfState
-from kalmark.models.state_view import sees_state, state_view_of
+from kalmark.models.state_view import sees_state
 from kalmark.slam.checks import measurements
 from kalmark.slam.held_control import Moving, RateMean
 from kalmark.slam.rests import Standing
@@ -74,7 +75,7 @@ class StateReader:
     def view(self) -> Any:
         """The view for `linearize`; made when it is first needed, as compiled code is."""
         if self._view is None:
-            self._view = state_view_of(self.sensor, self.motion, self.at)
+            self._view = view_of(self.sensor, None, self.at, self.motion)
         return self._view
 
     def noise(self, event: Scan) -> Array:

@@ -11,7 +11,8 @@ from kalmark.errors import MapError
 from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Correction, Update
 from kalmark.geometry.spaces import SE2, SE3, Space
-from kalmark.models.observe import fix_view
+from kalmark.models.observe import view_of
+from kalmark.models.sensors import Gps2D, Gps3D
 from kalmark.report import JudgedScan, Observation, Report, outcomes_of
 from kalmark.slam import moves, replacing
 from kalmark.slam.alternative import Alternative, write_robot
@@ -21,6 +22,7 @@ from kalmark.slam.reader import StateReader
 from kalmark.slam.state import State
 
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+ANTENNAS = {2: Gps2D(), 3: Gps3D()}  # a fix is a reading of one
 FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes stay within
 
 
@@ -99,7 +101,7 @@ def fix(state: State, event: Fix) -> Report:
     if state.repeats((event.robot, ""), event.t_ns, report.y):
         return record_repeated_reading(report, [event.robot], size, event.robot)
     gate, R = state.settings.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
-    update = Update(fix_view(ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
+    update = Update(view_of(ANTENNAS[size], None, ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
     estimator, other = state.estimator.for_fixes(), state.alternatives.get(event.robot)
     fits = other is not None and other.correct(estimator, update)
     if event.robot in state.sums:

@@ -19,12 +19,11 @@ from kalmark.filter.nearest_blocks import has_place
 from kalmark.geometry.gaussian import gate
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
-from kalmark.models.known_view import known_view
 from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
 from kalmark.models.observe import is_built_in, landmark_at, linearize, sensor_pose, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
-from kalmark.models.velocity_view import moving_view_of, velocity_of
+from kalmark.models.state_view import velocity_of
 
 Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
 
@@ -51,21 +50,18 @@ class ObservationModel:
     motion: Any = None
     since: Array = field(default_factory=lambda: np.zeros(1))
 
+    known: bool = False
+    """Whether the landmarks are known exactly: y (K, m + n) ends with their numbers, and the slots are the robot's."""
+
     @cached_property
     def model(self) -> Any:
         """The view for `linearize`.  Made when it is first needed: models that are built in are compiled then."""
-        return self.view()
-
-    def view(self) -> Any:
-        """Return what `linearize` takes of landmarks in the map."""
-        if isinstance(self.sensor, protocols.SeesVelocity):
-            return moving_view_of(self.sensor, self.landmark, self.motion, self.at, self.since)
-        return view_of(self.sensor, self.landmark, self.at)
+        return view_of(self.sensor, self.landmark, self.at, self.motion, self.since)
 
     @cached_property
-    def exactly(self) -> KnownModel:
+    def exactly(self) -> ObservationModel:
         """The same for landmarks known exactly, which are not in the map."""
-        return KnownModel(self.landmark, self.sensor, self.at, self.motion, self.since)
+        return replace(self, known=True)
 
     @cached_property
     def built_in(self) -> bool:
@@ -74,8 +70,8 @@ class ObservationModel:
 
     @cached_property
     def d(self) -> int:
-        """Number of the landmark's components that are observed."""
-        return self.landmark.space.size
+        """Number of the landmark's components in the map that are observed."""
+        return 0 if self.known else self.landmark.space.size
 
     def predict(
         self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array
@@ -97,20 +93,6 @@ class ObservationModel:
     def __getstate__(self) -> dict[str, Any]:
         """Return all but the compiled model, whose addresses mean nothing to another process."""
         return {name: value for name, value in self.__dict__.items() if name not in ("model", "exactly")}
-
-
-class KnownModel(ObservationModel):
-    """Observation of landmarks known exactly: y (K, m + n) ends with their numbers, and the slots are the robot's."""
-
-    @cached_property
-    def model(self) -> Any:
-        """The view for `linearize`."""
-        return known_view(self.view())
-
-    @cached_property
-    def d(self) -> int:
-        """None of the landmark's numbers are in the map."""
-        return 0
 
 
 def huber_length(dof: int) -> float:
