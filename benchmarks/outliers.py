@@ -24,7 +24,8 @@ from kalmark.simulate import load_world, simulate
 FIELD = ("world.count=40", "world.size_m=24", "steps=500", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")
 REACH_M = 12.0
 WAYS: dict[str, tuple[str, ...]] = {
-    "all taken": (),
+    "all taken": ("filter.association={type: identity, gate: off}",),
+    "default": (),
     "gate .9999": ("filter.association={type: identity, gate: 0.9999}",),
     "huber": ("robots.rover.sensors.lidar.robust=huber",),
     "student": ("robots.rover.sensors.lidar.robust=student",),

@@ -149,7 +149,7 @@ def test_two_landmarks_that_are_moved_far_are_named_and_the_robot_is_not_kidnapp
     verdict = km.diagnose(run_with_moved([5, 20], (-3.0, 2.0)))
     assert (verdict.map, verdict.causes[0].name) == ("doubtful", "moving_landmark")
     assert "landmarks 20, 5 are elsewhere" in verdict.causes[0].evidence
-    assert verdict.causes[0].cure == "--set association.gate=0.9999"
+    assert verdict.causes[0].cure == "give each thing an id of its own, and a thing that is moved a new one"
     assert "kidnapped" not in [cause.name for cause in verdict.causes]
     assert "e-" not in next(verdict_lines(verdict.as_dict()))
 

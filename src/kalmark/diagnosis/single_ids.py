@@ -35,8 +35,9 @@ TEXTS = {  # of one, and of several
     TWO: ("id {} is on two things", "ids {} are on two things each"),
     GONE: ("landmark {} is elsewhere: moved", "landmarks {} are elsewhere: moved"),
 }
+ANOTHER = ", and fit another one far more often than by chance"
 SECOND = " (2)"  # after an id, of what does not fit it
-CURE = f"--set association.gate={GATE}"
+CURE, OWN_ID = f"--set association.gate={GATE}", "give each thing an id of its own, and a thing that is moved a new one"
 
 
 def gated(config: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -48,13 +49,15 @@ def gated(config: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Run] | None:
     """Return that ids do not mean one place each, or single sightings are off, and the log filtered without that."""
-    config, h = gated(run.config), run.history
-    number = np.unique(h.id[(now.values > OFF) & (h.id != "")], return_counts=True)[1]
-    many = number.max(initial=0) >= LEAST or int((now.values[h.id != ""] > 2.0 * OFF).sum()) >= LEAST
-    if not many or (first := run if config == run.config else filter_events(config, log, log.events)) is None:
+    config = gated(run.config)
+    if not _are_many_off(run.history, now):
+        return None
+    first = run if config == run.config else filter_events(config, log, log.events)
+    if first is None:
         return None
     before, out = fit_of_run(first), _elsewhere(first.history)
     gain, mean = likelihood_gain(now, before), max(before.mean, 1.0)
+    cure = CURE if gain > SURELY * mean else OWN_ID  # a gate helps no more where all of this is left out already
     found, wrong, more = _places_of_ids(config, log, first, out)
     if not out.any():
         return None
@@ -62,16 +65,23 @@ def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Run] | None:
     of_others = _of_others(config, log, first, rest) if len(rest) >= LEAST else 0.0
     mixed = of_others > SURELY * mean
     if found is not None and not mixed:
-        return (found[0]._replace(gain=gain + more), found[1]) if gain + more > SURELY * mean else None
+        return (found[0]._replace(cure=cure, gain=gain + more), found[1]) if gain + more > SURELY * mean else None
     gain += more + (of_others if mixed else 0.0)
     by_itself = before.mean < FITS and -math.log(1.0 - GATE) * float(out.sum()) > SURELY * mean
     if gain < SURELY * mean and not by_itself:  # the filter may have left it out, which chance does seldom
         return None
     evidence = f"{out.mean():.1%} of the observations are far off where their landmark is"
-    name, told = (TWICE, ", and fit another one far more often than by chance") if mixed else (OUTLIERS, "")
+    name, cure, told = (TWICE, cure, ANOTHER) if mixed else (OUTLIERS, CURE, "")
     without = first if found is None else found[1]
     since_s = _since_s(first, np.flatnonzero(out))
-    return Mistake(name, evidence + told, CURE, config, None, gain, since_s), without
+    return Mistake(name, evidence + told, cure, config, None, gain, since_s), without
+
+
+def _are_many_off(h: History, now: Fit) -> bool:
+    """Return whether so many sightings do not fit, of one id, or far off of any."""
+    named = h.id != ""
+    number = np.unique(h.id[named & (now.values > OFF)], return_counts=True)[1]
+    return bool(number.max(initial=0) >= LEAST or (now.values[named] > 2.0 * OFF).sum() >= LEAST)
 
 
 def _of_others(config: Mapping[str, Any], log: Log, first: Run, rows: Ints) -> float:

@@ -25,7 +25,6 @@ from kalmark.diagnosis.jumps import LISTED, Controls, merge_jumps
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.lost import find_lost_robots, unchecked_ends
 from kalmark.diagnosis.mistakes import LATE, Mistake
-from kalmark.diagnosis.single_ids import LEAST as SIGHTINGS
 from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
 from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
 from kalmark.diagnosis.trials import FITS, LOST, filter_events, fit_of_run, likelihood_gain, with_cure
@@ -504,7 +503,7 @@ def _remapped_landmarks(run: Run) -> Iterator[Cause]:
         rows = np.flatnonzero((h.id == change.landmark) & (h.step <= change.step))
         now_s, begun_s = (float(h.t_ns[step]) * 1e-9 for step in (change.step, h.step[rows].min(initial=change.step)))
         score, cure = 0.5 * MOST_D2 * len(rows), f"leave out its first sighting, at t={begun_s:.1f} s"
-        if (h.outcome[rows] != "rejected").sum() >= SIGHTINGS:
+        if (h.outcome[rows] != "rejected").sum() > 1:  # there, too, sightings agreed
             told = f"landmark {change.landmark} was moved by t={now_s:.1f} s: from then on it is mapped there"
             yield Cause(MOVED, now_s, score, told, "", True)
             continue
