@@ -8,7 +8,7 @@ What is before `expect` are the links of a chain, one function for each of the t
 `expectation` is the readable form of the first.  The filter's kernels call `linearize`: `linearize_chain`, compiled,
 for the built-in models, a `PythonView` for a user's.  Both are tested to be equal.  What is behind the robot's pose in
 the head is, where the map has it, the mount, with the parameters that the sensor has in the map behind it; of a sensor
-that sees its own velocity, whose mount is known, it is the block that tells this: the state or a clone.
+that sees its own velocity, whose mount is known, it is the state or a clone, from which its velocity follows.
 
 Any of the blocks may be a given value, of which no Jacobian is asked for: a mount that is not in the head, and what
 stands behind the numbers that are measured.  Those are the numbers of a landmark known exactly, and for a sensor of
@@ -135,7 +135,7 @@ class PythonView:
 
     @property
     def moving(self) -> bool:
-        """True if the block behind the robot's pose tells the sensor's velocity, and is no mount."""
+        """True if the block behind the robot's pose determines the velocity of the sensor, and is no mount."""
         return self.landmark is not None and isinstance(self.sensor, SeesVelocity)
 
     def linearize(self, head: Array, l: Array, y: Array) -> tuple[Array, Array, Array, Array]:
@@ -265,7 +265,7 @@ def sensor_address() -> int:
 def place_of_sensor(compose_at: int, at: Array, moving: int, head: Array) -> tuple[Array, Array]:
     """Return the position S (2 or 3,) of a sensor whose mount is `at` or in the head (h,), and S_h (2 or 3, h).
 
-    It does not depend on a block of the head that tells the velocity of a `moving` one.
+    It does not depend on a block of the head that determines the velocity of a `moving` one.
     """
     pose, mounted = len(at), len(head) > len(at) and moving == 0
     T, T_r, T_s = call_compose(compose_at, (head[:pose], head[pose : 2 * pose] if mounted else at))
@@ -281,7 +281,7 @@ def place_of_sensor(compose_at: int, at: Array, moving: int, head: Array) -> tup
 
 @compiled
 def is_moving(view: View) -> int:
-    """Return 1 if what is behind the robot's pose in the head tells the sensor's velocity, 0 if it is a mount."""
+    """Return 1 if the block behind the robot's pose in the head has the velocity of the sensor, 0 if it is a mount."""
     return 1 if view[3] != 0 and view[4] != 0 else 0
 
 
