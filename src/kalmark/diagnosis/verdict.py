@@ -236,7 +236,7 @@ def without_error(run: Run, log: Log, finding: Finding) -> tuple[float, Run, Log
 
 
 def _bent(run: Run, without: Run) -> tuple[str, float]:
-    """Return the status of a map by its shape in a run without a cause, and by what it is off, m.
+    """Return the status of a map by its shape in a run without a cause, and by what that is off, m, beyond its sigma.
 
     Landmarks without ids are compared with those next to them: two of which one is left were one thing.
     """
@@ -260,7 +260,7 @@ def _bent(run: Run, without: Run) -> tuple[str, float]:
     off_m, extent_m = math.sqrt(float(np.mean(off**2))), rmse(places - places.mean(axis=0))
     wrong = twice + lacking + int(((off > SIGMAS * sigma) & (off > LEAST * extent_m)).sum())
     status = _status(off_m, extent_m, float(np.median(sigma)))
-    return worst_status(status, DOUBTFUL if wrong > FEW * len(at) else OK), off_m
+    return worst_status(status, DOUBTFUL if wrong > FEW * len(at) else OK), 0.0 if status == OK else off_m
 
 
 def _with_signs(run: Run, verdict: Verdict) -> Verdict:
