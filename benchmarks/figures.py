@@ -491,7 +491,6 @@ def outliers() -> Iterator[Figure]:
     ):
         for way, start in (
             ("all taken", "all taken"),
-            ("by default", "default"),
             ("gate .9999", "gate .9999"),
             ("`huber`", "huber"),
             ("`student`", "student"),

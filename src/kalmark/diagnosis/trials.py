@@ -127,10 +127,10 @@ class Trials:
         return REFUSED if run is None else fit_of_run(run, change.shrunk)
 
     def explain(self, change: Mistake) -> Iterator[Mistake]:
-        """Yield a change with its gain, if the events are surely likelier with it, whatever their noise."""
+        """Yield a change with its gain, if the events fit with it, and are surely likelier."""
         after = self.with_change(change)
         gain = likelihood_gain(self.as_it_is, after)
-        if gain > SURELY * max(after.mean, 1.0):
+        if after.mean < FITS and gain > SURELY * max(after.mean, 1.0):
             yield change._replace(gain=gain, since_s=self.events[0].t_s)
 
 

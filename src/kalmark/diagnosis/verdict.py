@@ -244,21 +244,20 @@ def _bent(run: Run, without: Run) -> tuple[str, float]:
     names = [[str(i) for i in r.landmarks.ids] for r in (run, without)]
     if len(places) < NEEDED or len(mine) < NEEDED:
         return WRONG, math.inf
+    at = np.array([names[1].index(name) if name in names[1] else -1 for name in names[0]])
     if (run.history.id == "").any():
         if len(run.history.poses) == len(without.history.poses):
             known = ~(while_lost(run.history) | while_lost(without.history))
             mine = rigid(*(r.history.poses[known, : run.history.d] for r in (run, without)))(mine)
-        at = cKDTree(np.nan_to_num(places)).query(np.nan_to_num(mine))[1]
-    else:
-        at = np.array([names[1].index(name) if name in names[1] else -1 for name in names[0]])
+        nearest = cKDTree(np.nan_to_num(places)).query(np.nan_to_num(mine))[1]
+        at = np.where(np.isin(names[0], run.history.id), at, nearest)
     both = np.isfinite(mine).all(axis=1) & np.isfinite(places[at]).all(axis=1) & (at >= 0)
     if both.sum() < NEEDED:
         return WRONG, math.inf
-    twice, lacking = len(at) - len(np.unique(at)), len(places) - len(np.unique(at[both]))
-    mine, places = mine[both], places[at[both]]
+    mine, twice, places = mine[both], len(at) - len(np.unique(at)), places[at[both]]
     off, sigma = np.linalg.norm(rigid(mine, places)(mine) - places, axis=1), _sigma(sigmas[both])
     off_m, extent_m = math.sqrt(float(np.mean(off**2))), rmse(places - places.mean(axis=0))
-    wrong = twice + lacking + int(((off > SIGMAS * sigma) & (off > LEAST * extent_m)).sum())
+    wrong = twice + int(((off > SIGMAS * sigma) & (off > LEAST * extent_m)).sum())
     status = _status(off_m, extent_m, float(np.median(sigma)))
     return worst_status(status, DOUBTFUL if wrong > FEW * len(at) else OK), 0.0 if status == OK else off_m
 

@@ -144,13 +144,15 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
     placed = history.fused
     for gap in history.carried():  # by a robot that was elsewhere than the filter had it
         placed &= ~history.while_carried(gap)[history.step]
-    for change in (c for c in history.changes if c.reason == BEGUN_AGAIN):
+    again_begun = [change for change in history.changes if change.reason == BEGUN_AGAIN]
+    for change in again_begun:
         placed &= (history.landmark != change.landmark) | (history.step > change.step)
     fused = np.flatnonzero(placed)
     rows = _of_places(history, slam, fused if rows is None else rows)
     fused = _of_places(history, slam, fused)
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
     started = {name for row, name in names.items() if history.outcome[row] != "associated"}
+    started |= {ids.get(change.landmark, as_id(change.landmark)) for change in again_begun}
     beforehand = {ids.get(str(name), name): prior for name, prior in {**_surveyed(history), **(known or {})}.items()}
     for name in dict.fromkeys(names.values()):
         if name not in started and name not in beforehand and name not in robots:
