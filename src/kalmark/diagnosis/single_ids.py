@@ -117,7 +117,7 @@ def _places_of_ids(
         return None, [], 0.0
     places = {str(i): p for i, p in zip(again.landmarks.ids, again.landmarks.positions()[0], strict=True)}
     told = {name: _told(h, places, name) for name in wrong}
-    since_s = _since_s(again, np.concatenate([_in_order(h, name)[1][1] for name in wrong]))
+    since_s = _since_s(again, np.concatenate([_in_order(h, name)[-1][1] for name in wrong]))
     cause = MOVED if {*told.values()} <= {MOVES, GONE} else TWICE
     mistake = Mistake(cause, f"from t={since_s:.1f} s on {_together(told)}", CURE, config, None, 0.0, since_s)
     return (mistake, again), wrong, likelihood_gain(fit_of_run(first), after)
@@ -156,20 +156,26 @@ def _other(name: str) -> str:
 
 
 def _in_order(h: History, name: str) -> list[tuple[str, Ints]]:
-    """Return an id and its other name, and the rows of both, those that were seen first before the others."""
+    """Return an id and its other name, and the rows of both, those that were seen first before the others.
+
+    It is one of both where no sighting has the other one.
+    """
     rows = [(of, np.flatnonzero(h.id == of)) for of in (name, _other(name))]
-    return sorted(rows, key=lambda one: int(one[1].min(initial=len(h.id))))
+    return sorted(((of, mine) for of, mine in rows if len(mine)), key=lambda one: int(one[1][0]))
 
 
 def _told(h: History, places: Mapping[str, Array], name: str) -> str:
     """Return the meaning of an id in a run with names for both of its places."""
-    (_, old), (later, new) = _in_order(h, name)
+    *before, (later, new) = _in_order(h, name)
+    old = before[0][1] if before else new[:0]
     fits = h.outcome != "rejected"
     if later not in places or any(len(rows) >= LEAST and fits[rows].mean() < MOST for rows in (old, new)):
         return MOVES
     if fits[old[old > new.min()]].sum() > SHARE * len(old):
         return TWO
     others = {of: p for of, p in places.items() if of not in (name, _other(name)) and np.isfinite(p).all()}
+    if len(others) < 2:
+        return GONE
     every = cKDTree(np.array([*others.values()]))
     near = SAME * float(np.median(every.query(every.data, k=2)[0][:, 1]))
     away, k = every.query(places[later])
@@ -179,5 +185,6 @@ def _told(h: History, places: Mapping[str, Array], name: str) -> str:
 def _together(told: Mapping[str, str]) -> str:
     """Return what is said of ids, of those of one meaning at once."""
     names = {meaning: [name for name, of in told.items() if of == meaning] for meaning in told.values()}
-    lines = (TEXTS.get(of, (of, of))[len(mine) > 1].format(", ".join(mine)) for of, mine in names.items())
-    return "; ".join(lines)
+    return "; ".join(
+        TEXTS[of][len(mine) > 1].format(", ".join(mine)) if of in TEXTS else of for of, mine in names.items()
+    )

@@ -59,15 +59,6 @@ class Fit(NamedTuple):
         """Its mean over the observations; that of a log that the filter refuses, or that has none, is infinite."""
         return float(self.values.mean()) if len(self.values) else math.inf
 
-    @property
-    def chi2(self) -> float:
-        """The sum of the d2."""
-        return float(self.values @ self.dof)
-
-    def of(self, rows: slice) -> Fit:
-        """Return that of some observations."""
-        return Fit(*(part[rows] for part in self))
-
 
 REFUSED = Fit(np.zeros(0), np.zeros(0), np.zeros(0))
 
