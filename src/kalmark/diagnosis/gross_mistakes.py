@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.diagnosis.mistakes import LATE, Mistake, late_scans, mistakes, robot_section, with_value
-from kalmark.diagnosis.single_ids import OUTLIERS, find_wrong_ids, gated
+from kalmark.diagnosis.mistakes import LATE, Mistake, late_scans, mistakes, with_value
+from kalmark.diagnosis.single_ids import OUTLIERS, Filtered, find_wrong_ids, gated
 from kalmark.diagnosis.trials import (
     FITS,
     MISFIT,
@@ -27,6 +27,7 @@ from kalmark.diagnosis.trials import (
     first_of,
     fit_of_run,
     likelihood_gain,
+    log_from,
 )
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry.frames3d import to_euler_pose
@@ -45,10 +46,10 @@ WINDOW = 30  # observations, over which is asked whether the log fits from there
 STEPS = (-4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)  # by which scans may be late
 
 
-def gross(run: Run, log: Log, alarmed: bool = False, progress: bool = False) -> tuple[Mistake, Run | None] | None:
+def gross(run: Run, log: Log, alarmed: bool = False, progress: bool = False) -> tuple[Mistake, Filtered | None] | None:
     """Return the mistake that explains most why a run does not fit, None if it does fit or if none explains it.
 
-    It is looked for where something else is `alarmed`, too.  With it comes the log filtered without it, if all was.
+    It is looked for where something else is `alarmed`, too.  With it comes the log filtered without it, if that was.
     """
     if not run.config.get("robots"):
         return None
@@ -58,7 +59,7 @@ def gross(run: Run, log: Log, alarmed: bool = False, progress: bool = False) -> 
     now = fit_of_run(run)
     first, fits = misfits_from(now), now.mean < MISFIT and not run.stopped
     of_ids = find_wrong_ids(run, log, now)
-    if of_ids is not None and fit_of_run(of_ids[1]).mean < FITS:
+    if of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS:
         return of_ids
     alone = None if fits and not alarmed else likeliest(run, log, first_events(run, log), run.config, progress)
     if alone is None and first is not None:
@@ -104,19 +105,11 @@ def find_later_mistake(run: Run, log: Log, first: int) -> Mistake | None:
 
     The log is filtered again from there, from the robots' poses.
     """
-    t_ns, _, rest = _from(run, log, first)
-    config = run.config
-    for robot in run.history.robots if not run.history.in_space else ():
-        before = np.flatnonzero((run.history.robot == robot) & (run.history.t_ns < t_ns))
-        if len(before):
-            x, y, theta = run.history.poses[before[-1]].tolist()
-            path = ("robots", robot_section(config, robot))
-            section = {**config["robots"][path[1]], "start": {"x_m": x, "y_m": y, "theta_rad": theta}}
-            config = with_value(config, ("robots", robot), section)
-    found = likeliest(run, log, rest, config)
+    config, rest = log_from(run, log, first)
+    found = likeliest(run, rest, first_events(run, rest.events), config)
     if found is None:
         return None
-    evidence = f"from t={t_ns * 1e-9:.1f} s on {found.evidence}"
+    evidence = f"from t={rest.events[0].t_s:.1f} s on {found.evidence}"
     return found._replace(evidence=evidence, cure="")
 
 
@@ -247,10 +240,3 @@ def _rows_of(e: Scan, rows: list[int]) -> Scan:
     cov = e.cov[rows] if e.cov is not None and e.cov.ndim == 3 else e.cov
     ids = None if e.ids is None else tuple(e.ids[k] for k in rows)
     return replace(e, y=e.y[rows], ids=ids, cov=cov)
-
-
-def _from(run: Run, log: Log, row: int) -> tuple[int, str, list[Event]]:
-    """Return the time and robot of an observation, and the events of the log from there."""
-    step = int(run.history.step[row])
-    t_ns = int(run.history.t_ns[step])
-    return t_ns, str(run.history.robot[step]), first_events(run, [e for e in log.events if e.t_ns >= t_ns])

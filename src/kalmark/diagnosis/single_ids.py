@@ -8,22 +8,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import rel_entr
 
 from kalmark.arrays import Array, Flags
 from kalmark.diagnosis.mistakes import Mistake, with_value
-from kalmark.diagnosis.trials import FITS, SURELY, Fit, filter_events, fit_of_run, likelihood_gain
+from kalmark.diagnosis.trials import FITS, SURELY, Fit, filter_events, fit_of_run, likelihood_gain, log_from
 from kalmark.events import Event, Scan
+from kalmark.geometry.gaussian import gate
 from kalmark.logs.log import Log
-from kalmark.results.history import History, Ints
+from kalmark.models.observe import linearize
+from kalmark.results.history import History, Ints, Texts, texts
 from kalmark.results.run import Run
+from kalmark.slam.state import State
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
+from kalmark.tracks.channel import Channel, ObservationModel
 
 GATE = 0.9999  # with which a log that does not fit is filtered again
 LEAST = 8  # sightings of an id that do not fit: it may mean another place
+MOST_TRIED = 20_000  # observations that are filtered again at once
 OFF = 6.0  # d2 per degree of freedom of a sighting that does not fit
 MOST = 0.5  # of the ids that were seen meanwhile: more of them are not moved, the robot is
 SHARE = 0.1  # of the sightings of an id that are of another place, or of a place after it was left
@@ -47,25 +54,40 @@ def gated(config: Mapping[str, Any]) -> Mapping[str, Any]:
     return with_value(config, ("association", "gate"), GATE)
 
 
-def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Run] | None:
-    """Return that ids do not mean one place each, or single sightings are off, and the log filtered without that."""
-    config = gated(run.config)
-    if not _are_many_off(run.history, now):
+class Filtered(NamedTuple):
+    """A log, or a part of it, and the run through a filter that it gave."""
+
+    run: Run
+    log: Log
+
+
+def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | None:
+    """Return that ids do not mean one place each, or single sightings are off, and the log filtered without that.
+
+    Of a log of more than `MOST_TRIED` observations that is the part about the first that do not fit.
+    """
+    config, far = gated(run.config), _first_off(run.history, now)
+    if far is None:
         return None
-    first = run if config == run.config else filter_events(config, log, log.events)
+    whole = len(now.values) <= MOST_TRIED
+    if not whole:
+        config, log, now = _part(run, log, now, far)
+    first = run if whole and config == run.config else filter_events(config, log, log.events)
     if first is None:
         return None
     before, out = fit_of_run(first), _elsewhere(first.history)
-    gain, mean = likelihood_gain(now, before), max(before.mean, 1.0)
+    new = np.flatnonzero(first.history.outcome == "new") if len(before.values) == len(now.values) else None
+    gain, mean = likelihood_gain(now, before, new), max(before.mean, 1.0)
     cure = CURE if gain > SURELY * mean else OWN_ID  # a gate helps no more where all of this is left out already
     found, wrong, more = _places_of_ids(config, log, first, out)
     if not out.any():
         return None
     rest = np.flatnonzero(out & ~np.isin(first.history.id, wrong))
-    of_others = _of_others(config, log, first, rest) if len(rest) >= LEAST else 0.0
+    of_others = _of_others(first, rest) if len(rest) >= LEAST else 0.0
     mixed = of_others > SURELY * mean
     if found is not None and not mixed:
-        return (found[0]._replace(cure=cure, gain=gain + more), found[1]) if gain + more > SURELY * mean else None
+        cured = found[0]._replace(cure=cure, gain=gain + more), Filtered(found[1], log)
+        return cured if gain + more > SURELY * mean else None
     gain += more + (of_others if mixed else 0.0)
     by_itself = before.mean < FITS and -math.log(1.0 - GATE) * float(out.sum()) > SURELY * mean
     if gain < SURELY * mean and not by_itself:  # the filter may have left it out, which chance does seldom
@@ -74,25 +96,75 @@ def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Run] | None:
     name, cure, told = (TWICE, cure, ANOTHER) if mixed else (OUTLIERS, CURE, "")
     without = first if found is None else found[1]
     since_s = _since_s(first, np.flatnonzero(out))
-    return Mistake(name, evidence + told, cure, config, None, gain, since_s), without
+    return Mistake(name, evidence + told, cure, config, None, gain, since_s), Filtered(without, log)
 
 
-def _are_many_off(h: History, now: Fit) -> bool:
-    """Return whether so many sightings do not fit, of one id, or far off of any."""
+def _part(run: Run, log: Log, now: Fit, far: int) -> tuple[Mapping[str, Any], Log, Fit]:
+    """Return `MOST_TRIED` observations of a log about one that is far off: configuration, log and their fit."""
+    h, last = run.history, len(now.values) - 1
+    begin = h.step[max(min(far - MOST_TRIED // 2, last - MOST_TRIED), 0)]
+    end = h.step[min(np.searchsorted(h.step, begin) + MOST_TRIED, last)]
+    config, part = log_from(run, log, int(np.searchsorted(h.step, begin)))
+    part = replace(part, events=[e for e in part.events if e.t_ns <= h.t_ns[end]])
+    within = (h.t_ns[h.step] >= h.t_ns[begin]) & (h.t_ns[h.step] <= h.t_ns[end])
+    return gated(config), part, Fit(*(column[within] for column in now))
+
+
+def _first_off(h: History, now: Fit) -> int | None:
+    """Return the first sighting that does not fit, None unless many of one id do not, or many are far off."""
     named = h.id != ""
-    number = np.unique(h.id[named & (now.values > OFF)], return_counts=True)[1]
-    return bool(number.max(initial=0) >= LEAST or (now.values[named] > 2.0 * OFF).sum() >= LEAST)
+    off = np.flatnonzero(named & (now.values > OFF))
+    number = np.unique(h.id[off], return_counts=True)[1]
+    if number.max(initial=0) >= LEAST or (now.values[off] > 2.0 * OFF).sum() >= LEAST:
+        return int(off[0])
+    return None
 
 
-def _of_others(config: Mapping[str, Any], log: Log, first: Run, rows: Ints) -> float:
-    """Return the logarithm of how much likelier sightings are, each as one of any landmark as likely as of none."""
-    config = with_value(config, ("association",), {"type": "auto"})
-    hidden = filter_events(config, log, _renamed(log, first, rows, None))
-    if hidden is None:
-        return -math.inf
-    gains = (fit_of_run(hidden).likelihoods - fit_of_run(first).likelihoods)[rows] - math.log(len(first.landmarks))
-    gains[hidden.history.outcome[rows] != "associated"] = -np.inf
-    return float(np.logaddexp(math.log(0.5), gains + math.log(0.5)).sum())
+def _of_others(first: Run, rows: Ints) -> float:
+    """Return by how much likelier it is that sightings fit other landmarks more often than those do that fit their own.
+
+    That is the logarithm of a likelihood ratio.  How often chance does it depends on how landmarks are crowded.
+    """
+    fit = np.flatnonzero((first.history.outcome == "associated") & (first.history.id != ""))
+    usual = fit[np.linspace(0, len(fit) - 1, min(len(fit), len(rows))).astype(np.int64)]
+    (k, n), (others, number) = ((int(of.sum()), len(of)) for of in (_fit_others(first, r) for r in (rows, usual)))
+    p, chance = k / n, (others + 1) / (number + 2)
+    return float(rel_entr(p, chance) + rel_entr(1.0 - p, 1.0 - chance)) * n if p > chance else 0.0
+
+
+def _fit_others(first: Run, rows: Ints) -> Flags:
+    """Return which sightings (N,) fit another landmark than their own.
+
+    Robots are where the run had them then, landmarks where it has them in the end.
+    """
+    h, state, fit = first.history, first.final_slam().state, np.zeros(len(rows), dtype=np.bool_)
+    places = {key: _places(state, channel) for key, channel in state.channels.items()}
+    for i, k in enumerate(rows.tolist()):
+        key = str(h.robot[h.step[k]]), str(h.sensor[k])
+        channel = state.channels[key]
+        head = channel.head(state.map, state.moving[key[0]].slot)
+        head[: len(channel.at)] = h.poses[h.step[k]]
+        y = h.y[k, : len(channel.sensor.columns)]
+        for model, names, l in places[key]:
+            z = linearize(model.model, head, l, np.tile(y, (len(l), 1)))[1]
+            Z = h.Z[k, : z.shape[1], : z.shape[1]]
+            if np.isfinite(Z).all():
+                d2 = np.sum(z * np.linalg.solve(Z, z.T).T, axis=1)
+                fit[i] |= bool(((d2 < gate(GATE, len(Z))) & (names != h.id[k])).any())
+    return fit
+
+
+def _places(state: State, channel: Channel) -> list[tuple[ObservationModel, Texts, Array]]:
+    """Return names (K,) and numbers (K, n) of the landmarks that a sensor can observe, by their models."""
+    tracks, found = state.tracks, list[tuple[ObservationModel, Texts, Array]]()
+    mapped, known = tracks.observable(channel), list(tracks.known)
+    for model, at in tracks.by_model(channel, mapped):
+        names = [mapped[i] for i in at]
+        found.append((model, texts(names), state.map.means(tracks.slots_of(names), model.d)))
+    for model, at in tracks.known_by_model(channel, known):
+        names = [known[i] for i in at]
+        found.append((model, texts(names), tracks.known.means(names)))
+    return found
 
 
 def _places_of_ids(
@@ -136,8 +208,8 @@ def _elsewhere(h: History) -> Flags:
     return np.asarray(out)
 
 
-def _renamed(log: Log, run: Run, rows: Ints, name: Callable[[str], str] | None) -> list[Event]:
-    """Return the events of a log in which the sightings of some rows of a run have other names, or none."""
+def _renamed(log: Log, run: Run, rows: Ints, name: Callable[[str], str]) -> list[Event]:
+    """Return the events of a log in which the sightings of some rows of a run have other names."""
     h = run.history
     keys = {(h.t_ns[h.step[k]], h.robot[h.step[k]], h.sensor[k], h.index[k]) for k in rows.tolist()}
 
@@ -145,7 +217,7 @@ def _renamed(log: Log, run: Run, rows: Ints, name: Callable[[str], str] | None) 
         if not isinstance(e, Scan) or e.ids is None:
             return e
         mine = [(e.t_ns, e.robot, e.sensor, k) in keys for k in range(len(e.ids))]
-        ids = [(name and name(str(i))) if other else i for i, other in zip(e.ids, mine, strict=True)]
+        ids = [name(str(i)) if other else i for i, other in zip(e.ids, mine, strict=True)]
         return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y, ids=ids, cov=e.cov) if any(mine) else e
 
     return [*map(renamed_event, log.events)]

@@ -18,7 +18,7 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree, parse_value
-from kalmark.diagnosis.mistakes import Mistake, configured_value, with_value
+from kalmark.diagnosis.mistakes import Mistake, configured_value, robot_section, with_value
 from kalmark.errors import KalmarkError, LogError
 from kalmark.events import Event, Scan, sort_key
 from kalmark.logs.log import Log
@@ -157,6 +157,22 @@ def first_events(run: Run, events: Iterable[Event], most: int = SCANS) -> list[E
             if scans >= most or observations >= OBSERVATIONS or n >= EVENTS:
                 break
     return found
+
+
+def log_from(run: Run, log: Log, row: int) -> tuple[dict[str, Any], Log]:
+    """Return the log from the scan of an observation on, and a configuration for it.
+
+    In the plane robots start where they were before it.
+    """
+    t_ns, config = run.history.t_ns[run.history.step[row]], dict(run.config)
+    for robot in run.history.robots if not run.history.in_space else ():
+        before = np.flatnonzero((run.history.robot == robot) & (run.history.t_ns < t_ns))
+        if len(before):
+            x, y, theta = run.history.poses[before[-1]].tolist()
+            section = config["robots"][robot_section(config, robot)]
+            section = {**section, "start": {"x_m": x, "y_m": y, "theta_rad": theta}}
+            config = with_value(config, ("robots", robot), section)
+    return config, replace(log, events=[e for e in log.events if e.t_ns >= t_ns])
 
 
 def with_cure(config: Mapping[str, Any], log: Log, cure: str) -> tuple[dict[str, Any], Log, list[Event]] | None:

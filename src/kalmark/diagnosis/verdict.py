@@ -177,8 +177,8 @@ def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     untried = max((f.gain for f in _steady(verdict) if not _own_cure(run, f)), default=0.0)
     if cured is not verdict or untried > mistake.gain or (mistake.name == OUTLIERS and others):  # it explains more
         return cured
-    bent, off_m = _bent(run, without)
-    rest = _judged(without, log, _structural(without, log, off), most, progress)
+    bent, off_m = _bent(run, without.run)
+    rest = _judged(*without, _structural(*without, off), most, progress)
     shift_m = max(rest.shift_m or 0.0, off_m)
     return replace(rest, map=worst_status(bent, rest.map), causes=(cause, *rest.causes), shift_m=shift_m)
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from itertools import islice
 
 import numpy as np
 
@@ -122,7 +121,7 @@ def contest(state: State, scan: ScanContext, model: ObservationModel, group: Jud
     if not rivals and not misfits.any():
         return
     mine = [i for i, name in enumerate(group.names) if name in tracks.confirmed and name not in state.surveys.trial]
-    fitting = {group.names[i] for i in mine if not misfits[i]}
+    fitting = {group.names[i]: tracks.confirmed[group.names[i]].entered for i in mine if not misfits[i]}
     for i in mine:
         name, k = group.names[i], group.rows[i]
         rival = rivals.get(name)
@@ -138,8 +137,7 @@ def contest(state: State, scan: ScanContext, model: ObservationModel, group: Jud
     rivals = {t.of: t for t in tracks.tentative.values() if t.of is not None}
     contested = sum(rival.hits > 1 for rival in rivals.values())
     for name, rival in rivals.items():
-        older = set(islice(tracks.confirmed, rival.searched)) - {name}
-        rival.covisible |= fitting & older
+        rival.covisible |= {other for other, entered in fitting.items() if entered < rival.entered} - {name}
         if (rival.log_odds or 0.0) >= math.log(odds) and len(rival.covisible) >= contested and name in tracks.confirmed:
             state.remove(name)
             del tracks.tentative[rival.id]
@@ -164,7 +162,7 @@ def _begin(state: State, scan: ScanContext, name: Id, k: int, before: Track | No
         if not start.is_finite:
             return
         track = Track(f"other place of {name}", scan.channel.landmark, state.add(start), size_m=scan.size_of(k))
-        against, track.searched = state.tracks.confirmed[name].observations - 1, len(state.tracks.confirmed)
+        against, track.entered = state.tracks.confirmed[name].observations - 1, state.tracks.changes
         track.status, track.of, track.log_odds = Status.TENTATIVE, name, -OUTLIER * against
         if before is not None:
             track.log_odds, track.covisible = before.log_odds, before.covisible

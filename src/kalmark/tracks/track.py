@@ -78,8 +78,9 @@ class Track:
     compared with others.  `extent` (2,) are the abscissas of the segment observed of a line, `size_m` is the measured
     size of a tag.  `first` is the observation that started it, and
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
-    A tentative one may be where sightings `of` a landmark have it that do not fit that: then `log_odds` are those that
-    it is right, and `covisible` are those of the first `searched` landmarks that fitted meanwhile.
+    `entered` counts the changes of the map before it came into it.  A tentative one may be where sightings `of` a
+    landmark have it that do not fit that: then `log_odds` are those that it is right, and `covisible` are the landmarks
+    entered before it that fitted meanwhile.
     """
 
     id: Id
@@ -104,6 +105,7 @@ class Track:
     pending: Pending | None = None
     measurements: list[Measurement] = field(default_factory=list)
     of: Id | None = None
+    entered: int = 0
 
     def restored(self) -> None:
         """Check the counts and the extent of a file.  Raises MapError."""
@@ -188,7 +190,7 @@ class Tracks:
     # ------------------------------------------------------------------ landmarks
     def confirm(self, track: Track, observations: int = 1) -> None:
         """Make a landmark of the map of a track that has a block."""
-        track.status, track.observations = Status.CONFIRMED, observations
+        track.status, track.observations, track.entered = Status.CONFIRMED, observations, self.changes
         if isinstance(track.model, Segmented) and track.extent is None:
             track.extent = np.array(track.model.first_ends)
         self.enter(track)
