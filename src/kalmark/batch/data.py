@@ -162,10 +162,13 @@ class BatchReplay:
     def take(self, event: Event) -> None:
         """Replay one event; scans that are none of the given ones change nothing."""
         step, given = len(self.nodes), self.given
-        if event.robot not in given.robots or not self._counts(event):
+        if event.robot not in given.robots:
             return
-        if isinstance(event, Control):
+        counts = self._counts(event)
+        if isinstance(event, Control):  # it is in force where the next segment begins, too
             self.chain.take(event)
+        elif not counts:
+            return
         elif isinstance(event, Fix):
             self.fixed += 1
             if self.fixed <= given.fixes and self.fixed - 1 not in given.left_out:

@@ -80,12 +80,9 @@ class Course:
         self.shared: dict[int, Array] = {}
 
     def forget(self) -> None:
-        """Allow any motion since the node, without a control in force."""
+        """Allow any motion since the node; the control in force stays."""
         self.reset(self.node)
-        gaps = self.drive.gaps
-        if gaps is not None:
-            gaps.forget()
-        self.drive, self.moves, self.known = HeldInput(self.motion, gaps), 1, False
+        self.moves, self.known = 1, False
         self.Q[-1] = ANYWHERE**2 * np.eye(len(self.T))
 
     def add(self, part: MotionPart, roots: list[Array]) -> None:

@@ -78,10 +78,6 @@ class Gaps:
                 self._update_intervals()
         self._go_on(control.t_ns)
 
-    def forget(self) -> None:
-        """Drop the last control, but keep the usual interval: the motion until the next one is unknown."""
-        self.last_ns, self.since_ns, self.left_out_ns, self.late_ns = None, None, None, NEVER_NS
-
     def _go_on(self, t_ns: int) -> None:
         self.last_ns, self.since_ns, self.left_out_ns = t_ns, None, None
         self._expect_next()
