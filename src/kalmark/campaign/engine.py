@@ -1,16 +1,15 @@
 """The batched engine: runs of one world, filtered and scored in compiled code without Python in a step.
 
-A run has the numbers of the ordinary path (`simulation`, `score`) up to rounding.  It is simulated by the same functions
-as there, its robot driven in compiled code.  The filter calls the compiled prediction and correction that
-`Slam.process` calls, by their addresses.  `refusal` has the reasons why the engine does not run a world; a run that it
-cannot finish, such as one whose filter diverges, is left to the ordinary path, too.
+A run has the numbers of the ordinary path (`simulation`, `score`) up to rounding.  The simulator is the same, its robot
+driven in compiled code.  The filter calls the compiled prediction and correction that `Slam.process` calls, by their
+addresses.  `refusal` has the reasons why the engine does not run a world; a run that it cannot finish, such as one
+whose filter diverges, is left to the ordinary path, too.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -30,20 +29,16 @@ from kalmark.geometry.frames import compose, from_frame_many, inv_scan_many
 from kalmark.geometry.spaces import HEADING, VECTOR, Table
 from kalmark.management.attention import EVERYTHING
 from kalmark.models.landmarks import Point2D
-from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
 from kalmark.models.observe import step_of
 from kalmark.models.protocols import parameter_covariance, self_calibrating
 from kalmark.models.sensors import RangeBearing
 from kalmark.results.measures import MAP_NEES, log_translation, map_nees
-from kalmark.simulate.robots import Chance, Run, scenery_of
-from kalmark.simulate.routes import compiled_ways
-from kalmark.simulate.sights import POINTS, joined
+from kalmark.simulate.robots import Chance, drive_all, scenery_of, sight, spans
+from kalmark.simulate.routes import MOTIONS, compiled_ways
+from kalmark.simulate.sights import POINTS, Sighted
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
-
-MOTIONS = (Unicycle, Odometry2D, Ackermann)
-NO_CONTROL = np.zeros(0)  # the noise of controls does not depend on them
 
 PREDICT = signature_of(
     "b1(Tuple((f8[::1], f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8)), "
@@ -295,18 +290,14 @@ class _Filter:
         self.capacity = capacity_for(3 + 2 * landmarks)
         cov = np.zeros((3, 3)) if robot.cov is None else np.asarray(robot.cov)
         self.start = np.array(robot.start), np.array(cov)
-        self.control = motion.control_noise(NO_CONTROL), density_of(motion), motion.held
+        u = np.ones(len(motion.columns))
+        D = motion.diffusion(u, 1.0)
+        self.control = motion.control_noise(u), np.zeros((0, 0)) if D is None else D, motion.held
         s = mount.sensor
         self.sensed = np.array(mount.at), (s.sigma_range_m, s.sigma_range_rel, s.sigma_bearing_rad, s.scale, s.bias_m)
         limits = (estimator.iterations, float(estimator.tolerance)) if isinstance(estimator, Invariant) else (1, 0.0)
         self.rules = (float(channel.gate), *limits)
         self.coordinates = estimator.coordinates
-
-
-def density_of(motion: Any) -> Array:
-    """Return the diffusion of a motion that moves, (3, 3) a second; (0, 0) if it has none."""
-    D: Array | None = motion.diffusion(np.ones(len(motion.columns)), 1.0)
-    return np.zeros((0, 0)) if D is None else D
 
 
 def capacity_for(rows: int) -> int:
@@ -318,22 +309,29 @@ class Engine:
     """Runs of a world under several filters.  Made once for many runs: it compiles, or loads, what they call."""
 
     def __init__(self, world: World, configs: Mapping[str, Config]) -> None:
-        self.world, self.times = world, world.times()
+        self.world = world
         (name,) = world.robots
         self.robot = build_robot(world.models(), name)
         self.landmarks = len(scenery_of(world, np.random.default_rng(0))[POINTS].values)
         self.filters = {label: _Filter(build_slam(c), name, self.landmarks) for label, c in configs.items()}
         self.ways = compiled_ways(self.robot.motion, world.dt_s)
+        self.seconds = np.diff([0, *world.times()]) * 1e-9  # of each control: an increment's first has none before it
+        self.seconds[0] *= self.robot.motion.held
 
     def run(self, seed: SeedSequence, map_every: int) -> dict[str, Scores] | None:
         """Simulate and score one run under every filter; None if that is left to the ordinary path."""
-        run = Run.of(self.world, [self.robot], Chance(seed), self.ways)
-        (robot,), points = run.robots, run.things[POINTS].values
-        (carried,) = robot.sensors.values()
-        seen = joined(run.sight(robot, carried, steps[carried.sensing.scans_at(steps)]) for steps in run.spans())
-        if len(points) != self.landmarks:
+        world, chance = self.world, Chance(seed)
+        (robot,), things = drive_all(world, [self.robot], chance, self.ways)
+        (carried,), points = robot.sensors.values(), things[POINTS].values
+        parts = [
+            part
+            for steps in spans(world, [robot], things)
+            for part in sight(carried, robot, [robot], things, world, steps[carried.sensing.scans_at(steps)], chance)
+        ]
+        if len(points) != self.landmarks or not parts:
             return None
-        sightings = by_landmark(self.world.steps, seen.steps - 1, seen.ids, points[seen.ids - 1], seen.e)
+        seen = Sighted(*map(np.concatenate, zip(*parts, strict=True)))
+        sightings = by_landmark(world.steps, seen.steps - 1, seen.ids, points[seen.ids - 1], seen.e)
         scores = {}
         for label, one in self.filters.items():
             score = self._filter(one, robot.states, robot.told, sightings, map_every)
@@ -342,21 +340,13 @@ class Engine:
             scores[label] = score
         return scores
 
-    @cached_property
-    def _seconds(self) -> Array:
-        """The seconds (steps,) of each control: an increment's first one has none before it."""
-        dt_s = np.diff([0, *self.times]) * 1e-9
-        if not self.robot.motion.held:
-            dt_s[0] = 0.0
-        return dt_s
-
     def _filter(self, f: _Filter, states: Array, u: Array, sightings: Sightings, map_every: int) -> Scores | None:
         """Filter and score a run; None if the filter diverges."""
         N, density, held = f.control
         scored = map_every, f.coordinates == "log", states
         ok, mean, P, of_map, x, nis, fused = filter_run(
             f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
-            (u, self._seconds, N, density, held), sightings, f.sensed, f.rules, scored,
+            (u, self.seconds, N, density, held), sightings, f.sensed, f.rules, scored,
         )  # fmt: skip
         if not ok:
             return None

@@ -44,7 +44,7 @@ from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, velocity_of, view_of_state
 from kalmark.simulate import laser, sights
 from kalmark.simulate.layouts import Scenery
-from kalmark.simulate.routes import Course, Ways, disturb_state, drive_leg, python_ways
+from kalmark.simulate.routes import Course, Ways, aim, disturb_state, drive_leg, python_ways
 from kalmark.simulate.sights import POINTS, Sighted, SimulatedSensing, Things, gaussian, things_in_frame
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
@@ -53,7 +53,6 @@ Key = tuple[int, str, str]
 Found = tuple[int, str, Array, list[Id | None] | None, tuple[Id | None, ...]]  # step, sensor, y, ids and origins
 AT_ONCE = 2**14  # observations of landmarks, seen or not, that are made at once
 ROUNDS = 10  # of a fixed point: a constant changes a control by some percent
-NO_ROBOT = np.zeros(0, dtype=np.int64)
 WILD = 30.0  # by so many of its own errors an outlier of a sensor of the state is off
 
 
@@ -83,41 +82,22 @@ class SimSensor:
 
 @dataclass
 class SimRobot:
-    """A robot: its model, its course, and what it carries.
+    """A robot: its model, and what it carries.
 
-    `states` are the true ones (steps + 1, n), `told` the controls (steps, m) that its estimator is given, `done` those
-    that moved it; `constants` (c,) are those by which controls are wrong.
+    `states` (steps + 1, n) are the true ones, `poses` (steps + 1, 3 or 7) a view of them, `told` (steps, m) the
+    controls that its estimator is given, `done` those that moved it; by `constants` (c,) all controls are wrong.
     """
 
     name: str
     motion: Any
-    ways: Ways
-    course: Course
     sensors: dict[str, SimSensor]
     states: Array
+    poses: Array
     told: Array
     done: Array
+    course: Course
+    target: Array
     constants: Array
-
-    def pose(self, k: int) -> Array:
-        """Return the true pose (3,) or (7,) at step k."""
-        pose: Array = self.poses[k]
-        return pose
-
-    @property
-    def poses(self) -> Array:
-        """The true poses (steps + 1, 3 or 7)."""
-        return self.states[:, : 3 if self.motion.space.world == "plane" else 7]
-
-    def drive(self, k: int, last: int, chance: tuple[Array, int], rules: tuple[float, bool]) -> int:
-        """Drive from step k to the last one; see `drive_leg`, also for what is returned: how many z are used."""
-        leg = drive_leg if isinstance(self.ways[0][0], int) else python_form(drive_leg)
-        course, (z, at) = self.course, chance
-        while k < last:
-            course.aim(self.states[k])
-            to = course.controls, course.target, course.limits
-            k, at = leg(self.ways, to, (z, at), (k, last), rules, (self.states, self.told, self.done))
-        return at
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,34 +139,38 @@ def simulate(world: World, seed: int | SeedSequence | Generator = 0) -> Log:
 
 def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simulation:
     """Return one simulated run: its log and its truth."""
-    run = Run.of(world, [build_robot(world.models(), name) for name in world.robots], Chance(seed))
-    robots, times = run.robots, [0, *world.times()]
+    chance, times = Chance(seed), [0, *world.times()]
+    robots, things = drive_all(world, [build_robot(world.models(), name) for name in world.robots], chance)
     events: list[Event] = []
     origins: dict[Key, tuple[Id | None, ...]] = {}
     for robot in robots:
         if coasts(robot.motion) and robot.sensors:  # it moves from the first event on: the start
-            events.append(first_event(robot, next(iter(robot.sensors)), run.chance))
+            name = next(iter(robot.sensors))
+            scan = Scan(t_ns=0, robot=robot.name, sensor=name)
+            events.append(scan if robot.sensors[name].raw is None else raw_of(robot, name, 0, 0, chance))
     for robot in robots:
         at = times[:-1] if robot.motion.held else times[1:]
         events += [Control(t_ns=t_ns, robot=robot.name, u=u) for t_ns, u in zip(at, robot.told, strict=True)]
-    for steps in run.spans():
+    for steps in spans(world, robots, things):
         for robot in robots:
-            for k, name, y, ids, real in run.scans(robot, steps):
-                scan = Scan(t_ns=times[k], robot=robot.name, sensor=name, y=y, ids=ids)
-                events.append(scan)
+            for k, name, y, ids, real in sensor_scans(robot, robots, things, world, steps, chance):
+                events.append(Scan(t_ns=times[k], robot=robot.name, sensor=name, y=y, ids=ids))
                 origins[times[k], robot.name, name] = real
-            events += [raw for k in steps.tolist() for raw in raw_data(robot, k, times[k], run.chance)]
-    states = {r.name: r.states for r in robots}
+            for name, carried in robot.sensors.items():
+                if carried.raw is not None:
+                    at_k = steps[carried.sensing.scans_at(steps)].tolist()
+                    events += [raw_of(robot, name, k, times[k], chance) for k in at_k]
     log = Log(
         world.name, tuple(world.robots), sorted(events, key=sort_key), "simulated",
         truth={r.name: Trajectory(np.array(times), r.poses) for r in robots},
-        landmarks=true_landmarks(run.things),
+        landmarks=true_landmarks(things),
         control_columns={r.name: r.motion.columns for r in robots},
         sensor_columns={(r.name, name): s.columns for r in robots for name, s in r.sensors.items()},
     )  # fmt: skip
     mounts = {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}
-    carried = {(r.name, name): s.sensor for r in robots for name, s in r.sensors.items()}
-    return Simulation(log, states, mounts, origins, {r.name: r.constants for r in robots}, carried)
+    carried_ = {(r.name, name): s.sensor for r in robots for name, s in r.sensors.items()}
+    constants = {r.name: r.constants for r in robots}
+    return Simulation(log, {r.name: r.states for r in robots}, mounts, origins, constants, carried_)
 
 
 def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
@@ -204,14 +188,6 @@ def things_in(world: World, scenery: Scenery, rng: Generator) -> dict[str, Thing
     return things
 
 
-def area_of(scenery: Scenery, things: dict[str, Things]) -> Array:
-    """Return the lower and the upper corner of all there is (2, D)."""
-    places = [sort.centres() for sort in things.values() if len(sort.values)]
-    places += [scenery.corners] if len(scenery.corners) else []
-    centres = np.concatenate(places or [np.zeros((1, things[POINTS].dimensions))])
-    return np.array([centres.min(axis=0), centres.max(axis=0)])
-
-
 def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
     """Return by id the points (2|3,), segments (4|6,) from end to end and tags (7,)."""
     points = things[POINTS]
@@ -219,13 +195,13 @@ def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
     return {i: row.copy() for s, t in things.items() for i, row in enumerate(rows[s], t.first)}
 
 
-def sim_robot(world: World, robot: Robot, area: Array, chance: Chance, scenery: Scenery, ways: Ways) -> SimRobot:
+def sim_robot(world: World, robot: Robot, area: Array, chance: Chance, scenery: Scenery) -> SimRobot:
     """Put a robot at its start and its sensors on their mounts, drawn around configured values with sigmas.
 
     `area` (2, D) has the lower and the upper corner of the world, `scenery` may have raw data for them.
     """
     simulated, motion = world.robots[robot.name], robot.motion
-    states, m = np.empty((world.steps + 1, motion.space.size)), len(motion.columns)
+    states = np.empty((world.steps + 1, motion.space.size))
     states[0] = draw_start(robot, chance.route)
     sensors = {}
     for key, mount in robot.sensors.items():
@@ -237,8 +213,9 @@ def sim_robot(world: World, robot: Robot, area: Array, chance: Chance, scenery: 
     course = simulated.route.course(world.steps, world.dt_s, area, chance.route)
     model = self_calibrating(motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
-    told, done = np.empty((2, world.steps, m))
-    return SimRobot(robot.name, motion, ways, course, sensors, states, told, done, constants)
+    told, done = np.empty((2, world.steps, len(motion.columns)))
+    poses = states[:, : 3 if world.dimensions == 2 else 7]
+    return SimRobot(robot.name, motion, sensors, states, poses, told, done, course, next(course[1]), constants)
 
 
 def draw_start(robot: Robot, rng: Generator) -> Array:
@@ -286,123 +263,122 @@ def sensor_poses(poses: Array, at: Array) -> Array:
     return np.column_stack([place.real, place.imag, heading + at[2]])
 
 
-@dataclass
-class Run:
-    """A run: its chance, what there is to see, and its robots, which have driven through all steps."""
+def drive_all(
+    world: World, robots: Sequence[Robot], chance: Chance, ways: Ways | None = None
+) -> tuple[list[SimRobot], dict[str, Things]]:
+    """Drive robots through all steps, compiled in `ways`, or in Python; return also what there is to see."""
+    scenery, dt_s = world.world.scenery(chance.layout), world.dt_s
+    things = things_in(world, scenery, chance.layout)
+    places = [sort.centres() for sort in things.values() if len(sort.values)]
+    places += [scenery.corners] if len(scenery.corners) else []
+    centres = np.concatenate(places or [np.zeros((1, things[POINTS].dimensions))])
+    area = np.array([centres.min(axis=0), centres.max(axis=0)])
+    driven = [sim_robot(world, robot, area, chance, scenery) for robot in robots]
+    z = chance.control.standard_normal(sum(r.told.size + world.steps * r.motion.space.dof for r in driven))
+    all_ways = [ways or python_ways(robot.motion, dt_s) for robot in robots]
+    leg, at = drive_leg if ways else python_form(drive_leg), 0
+    stride = world.steps if len(driven) == 1 else 1  # robots share their chance
+    for first in range(0, world.steps, stride):
+        for r, by in zip(driven, all_ways, strict=True):
+            (controls, ahead, limits), k, last = r.course, first, first + stride
+            while k < last:
+                r.target = aim(r.target, ahead, 2 * limits[1], r.states[k])
+                course, rules = (controls, r.target, limits), (dt_s, world.noise_on == "robot")
+                k, at = leg(by, course, (z, at), (k, last), rules, (r.states, r.told, r.done))
+    for r in driven:
+        for carried in r.sensors.values():
+            carried.frames = sensor_poses(r.poses, carried.at)
+        if len(r.constants):
+            r.told = np.array([given_control(r.motion, u, r.constants, dt_s) for u in r.told])
+    return driven, things
 
-    world: World
-    chance: Chance
-    things: dict[str, Things]
-    robots: list[SimRobot]
 
-    @classmethod
-    def of(cls, world: World, robots: Sequence[Robot], chance: Chance, ways: Ways | None = None) -> Run:
-        """Return a run of robots, driven in their `ways`, by default in Python."""
-        scenery = world.world.scenery(chance.layout)
-        things = things_in(world, scenery, chance.layout)
-        area, dt_s = area_of(scenery, things), world.dt_s
-        driven = [sim_robot(world, r, area, chance, scenery, ways or python_ways(r.motion, dt_s)) for r in robots]
-        most = sum(r.told.shape[1] + r.motion.space.dof for r in driven)
-        z, at, stride = chance.control.standard_normal(world.steps * most), 0, world.steps if len(driven) == 1 else 1
-        for k in range(0, world.steps, stride):  # robots share their chance
-            for robot in driven:
-                at = robot.drive(k, k + stride, (z, at), (dt_s, world.noise_on == "robot"))
-        for robot in driven:
-            for carried in robot.sensors.values():
-                carried.frames = sensor_poses(robot.poses, carried.at)
-            if len(robot.constants):
-                told = [given_control(robot.motion, u, robot.constants, dt_s) for u in robot.told]
-                robot.told = np.array(told)
-        return cls(world, chance, things, driven)
+def spans(world: World, robots: list[SimRobot], things: dict[str, Things]) -> list[Index]:
+    """Return the steps of which the scans are made at once.
 
-    def spans(self) -> list[Index]:
-        """Return the steps of which the scans are made at once.
+    One by one where sensors share chance, false measurements draw more, or what is seen depends on earlier scans.
+    """
+    steps, size = np.arange(1, world.steps + 1), 1
+    carried = [sensor for robot in robots for sensor in robot.sensors.values()]
+    alone = carried if len(robots) == len(carried) == 1 and world.dimensions == 2 else []
+    for s in alone:
+        steady = not (s.laser or s.sensing.outliers or isinstance(s.sensor, OfState | SeesVelocity))
+        if steady and sights.looks_for(s.sensor) == POINTS:
+            size = max(1, AT_ONCE // max(1, len(things[POINTS].values)))
+    return [steps[k : k + size] for k in range(0, len(steps), size)]
 
-        One by one where sensors share chance, false measurements draw more, or what is seen depends on earlier scans.
-        """
-        steps, size = np.arange(1, self.world.steps + 1), 1
-        carried = [sensor for robot in self.robots for sensor in robot.sensors.values()]
-        of = carried[0] if len(self.robots) == len(carried) == 1 else None
-        if of is not None and not (of.laser or of.sensing.outliers or isinstance(of.sensor, OfState | SeesVelocity)):
-            if self.world.dimensions == 2 and sights.looks_for(of.sensor) == POINTS:
-                size = max(1, AT_ONCE // max(1, len(self.things[POINTS].values)))
-        return [steps[k : k + size] for k in range(0, len(steps), size)]
 
-    def scans(self, robot: SimRobot, steps: Index) -> Iterator[Found]:
-        """Yield the scans of a robot's sensors at some steps; empty ones are left out."""
-        for name, carried in robot.sensors.items():
-            at = steps[carried.sensing.scans_at(steps)]
-            if carried.raw is not None or not len(at) or isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
-                continue
-            if carried.laser is not None:
-                k = int(at[0])
-                y = laser.beams(carried.laser, carried.sensing, carried.frames[k], self.things, self.chance.sight)
-                if len(y):
-                    yield k, name, y, None, (None,) * len(y)
-            elif isinstance(carried.sensor, OfState):
-                k, dt_s = int(at[0]), self.world.dt_s
-                read, ids = reading(robot, carried, k, dt_s, self.chance), None
-                if carried.sensing.loop_reach_m is not None:
-                    read, ids = with_loop(robot, carried, k, dt_s, read, self.chance)
-                if read is not None:
-                    yield k, name, read, ids, (robot.name,) * len(read)
-            else:
-                yield from self._of_landmarks(name, carried, robot, at)
-
-    def _of_landmarks(self, name: str, carried: SimSensor, robot: SimRobot, steps: Index) -> Iterator[Found]:
-        seen = self.sight(robot, carried, steps)
-        names: dict[int, Id | None] = {-1 - i: r.name for i, r in enumerate(self.robots)} | {sights.FALSE: None}
-        ids, real = ([names.get(i, i) for i in part.tolist()] for part in (seen.ids, seen.real))
-        for k in np.unique(seen.steps).tolist():
-            rows = slice(*np.searchsorted(seen.steps, (k, k + 1)))
-            carried.last = k, robot.pose(k).copy()
-            yield k, name, seen.e[rows], ids[rows] if self.world.ids else None, tuple(real[rows])
-
-    def sight(self, robot: SimRobot, carried: SimSensor, steps: Index) -> Sighted:
-        """Return what a sensor of landmarks reports at some steps, with noise and faults."""
-        sensor, world, chance = carried.sensor, self.world, self.chance
-        there = self.things[sights.looks_for(sensor)]
-        seen = self._visible(robot, carried, there, steps)
-        landmarks = np.count_nonzero(seen.real > 0)
-        groups: Iterable[Index] = sights.reported_rows(
-            there, seen.rows(slice(landmarks)), world.new_per_step, world.max_per_scan, chance.sight
-        )
-        if landmarks < len(seen.real):
-            groups = [np.concatenate([*groups, np.arange(landmarks, len(seen.real))])]
-        reported = [seen.rows(slice(0))]
-        for rows in groups:
-            part = sights.report_with_faults(sensor, seen.rows(rows), carried.sensing, there, chance.faults)
-            part = part._replace(e=sights.noisy_measurements(sensor, part.e, chance.sight))
-            reported.append(part.rows(sights.is_reportable(sensor, part.e)))
-        return sights.joined(reported)
-
-    def _visible(self, robot: SimRobot, carried: SimSensor, there: Things, steps: Index) -> Sighted:
-        """Return what a sensor can observe at some steps, or at one: there other robots, too, which are last."""
-        sensor, T, d, others = carried.sensor, carried.frames[steps], self.world.dimensions, NO_ROBOT
-        moving = isinstance(sensor, SeesVelocity)  # it sees what stands still
-        if len(steps) > 1:
-            of, near, v = sights.points_in_reach(T, there.values, range_limit(sensor))
+def sensor_scans(
+    robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World, steps: Index, chance: Chance
+) -> Iterator[Found]:
+    """Yield the scans of a robot's sensors at some steps; empty ones are left out."""
+    names: dict[int, Id | None] = {-1 - i: r.name for i, r in enumerate(robots)} | {0: None}
+    for name, carried in robot.sensors.items():
+        at = steps[carried.sensing.scans_at(steps)]
+        if carried.raw is not None or not len(at) or isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
+            continue
+        k = int(at[0])
+        if carried.laser is not None:
+            y = laser.beams(carried.laser, carried.sensing, carried.frames[k], things, chance.sight)
+            if len(y):
+                yield k, name, y, None, (None,) * len(y)
+        elif isinstance(carried.sensor, OfState):
+            read, ids = reading(robot, carried, k, world.dt_s, chance), None
+            if carried.sensing.loop_reach_m is not None:
+                read, ids = with_loop(robot, carried, k, world.dt_s, read, chance)
+            if read is not None:
+                yield k, name, read, ids, (robot.name,) * len(read)
         else:
-            near = there.near(T[0, :d], range_limit(sensor))
-            if self.world.sight_robots and there.sort == POINTS and not moving:
-                others = np.array([i for i, r in enumerate(self.robots) if r is not robot], dtype=np.int64)
-            places = [self.robots[i].pose(steps[0])[:d] for i in others]
-            v = things_in_frame(there.sort, T[0], np.vstack([there.values[near], *places]))
-            of = np.zeros(len(v), dtype=np.int64)
-        if moving:
-            v = np.column_stack([v, np.tile(sensor_velocity(robot, carried, steps[0], self.world.dt_s), (len(v), 1))])
-        sizes, ids = np.append(there.sizes[near], 0.0 * others), np.append(near + there.first, -1 - others)
-        inside, e = sights.exact_measurements(sensor, v, sizes)
-        return Sighted(steps[of], ids, ids, v, e, sizes).rows(inside)
+            for seen in sight(carried, robot, robots, things, world, at, chance):
+                told, real = ([names.get(i, i) for i in part.tolist()] for part in (seen.ids, seen.real))
+                for k in np.unique(seen.steps).tolist():
+                    rows = slice(*np.searchsorted(seen.steps, (k, k + 1)))
+                    carried.last = k, robot.poses[k].copy()
+                    yield k, name, seen.e[rows], told[rows] if world.ids else None, tuple(real[rows])
 
 
-def raw_data(robot: SimRobot, k: int, t_ns: int, chance: Chance) -> list[Raw]:
-    """Return the raw data of a robot's sensors that give them, from its true pose at step k."""
-    return [
-        raw_of(robot, name, k, t_ns, chance)
-        for name, carried in robot.sensors.items()
-        if carried.raw is not None and carried.sensing.scans_at(k)
-    ]
+def sight(
+    carried: SimSensor, robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World,
+    steps: Index, chance: Chance,
+) -> Iterator[Sighted]:  # fmt: skip
+    """Yield what a sensor of landmarks reports at some steps, with noise and faults, all of a step at once."""
+    sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
+    seen = visible(carried, robot, robots, there, world, steps)
+    landmarks = np.count_nonzero(seen.real > 0)
+    groups: Iterable[Index] = sights.reported_rows(
+        there, seen.rows(slice(landmarks)), world.new_per_step, world.max_per_scan, chance.sight
+    )
+    if landmarks < len(seen.real):
+        groups = [np.concatenate([*groups, np.arange(landmarks, len(seen.real))])]
+    for rows in groups:
+        part = sights.report_with_faults(sensor, seen.rows(rows), carried.sensing, there, chance.faults)
+        part = part._replace(e=sights.noisy_measurements(sensor, part.e, chance.sight))
+        yield part.rows(sights.is_reportable(sensor, part.e))
+
+
+def visible(
+    carried: SimSensor, robot: SimRobot, robots: list[SimRobot], there: Things, world: World, steps: Index
+) -> Sighted:
+    """Return what a sensor can observe at some steps, or at one: there other robots, too, which are last."""
+    sensor, T, d, others = carried.sensor, carried.frames[steps], world.dimensions, np.zeros(0, dtype=np.int64)
+    if len(steps) != 1:
+        of, near, v = sights.points_in_reach(T, there.values, range_limit(sensor))
+    else:
+        near, k, moving = there.near(T[0, :d], range_limit(sensor)), int(steps[0]), isinstance(sensor, SeesVelocity)
+        if world.sight_robots and there.sort == POINTS and not moving:
+            others = np.array([i for i, r in enumerate(robots) if r is not robot], dtype=np.int64)
+        places = [robots[i].poses[k, :d] for i in others]
+        v = things_in_frame(there.sort, T[0], np.vstack([there.values[near], *places]))
+        of = np.zeros(len(v), dtype=np.int64)
+        if moving:  # it sees what stands still
+            k_before, before = carried.last or (0, robot.poses[0])
+            state = robot.states[k] if tells_velocity(robot.motion) else np.array(before)
+            since = np.array([(k - k_before) * world.dt_s, *robot.done[k - 1]])
+            t = velocity_of(robot.motion, carried.at, robot.poses[k], state, since)[0]
+            v = np.column_stack([v, np.tile(t, (len(v), 1))])
+    sizes, ids = np.append(there.sizes[near], 0.0 * others), np.append(near + there.first, -1 - others)
+    inside, e = sights.exact_measurements(sensor, v, sizes)
+    return Sighted(steps[of], ids, ids, v, e, sizes).rows(inside)
 
 
 def raw_of(robot: SimRobot, name: str, k: int, t_ns: int, chance: Chance) -> Raw:
@@ -412,21 +388,6 @@ def raw_of(robot: SimRobot, name: str, k: int, t_ns: int, chance: Chance) -> Raw
     return carried.raw(carried.frames[k], t_ns, robot.name, name, seed)
 
 
-def first_event(robot: SimRobot, name: str, chance: Chance) -> Event:
-    """Return the first event of a robot that moves without controls: an empty scan of a sensor, or raw data."""
-    if robot.sensors[name].raw is None:
-        return Scan(t_ns=0, robot=robot.name, sensor=name)
-    return raw_of(robot, name, 0, 0, chance)
-
-
-def sensor_velocity(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:
-    """Return the velocity (2 or 3,) of a sensor at step k in its frame, or the mean since its last scan."""
-    k_before, before = carried.last or (0, robot.pose(0))
-    state = robot.states[k] if tells_velocity(robot.motion) else np.array(before)
-    since = np.array([(k - k_before) * dt_s, *robot.done[k - 1]])
-    return velocity_of(robot.motion, carried.at, robot.pose(k), state, since)[0]
-
-
 def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Chance) -> Array | None:
     """Return what a sensor of the state reads at step k (1, m); None of the first one that counts from the last.
 
@@ -434,8 +395,8 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
     """
     of, at = carried.sensor, carried.at
     last, walked_s = carried.last, (k - carried.walked) * dt_s
-    before, k_before = (robot.pose(0), 0) if last is None else last[::-1]
-    since_s, carried.last, carried.walked = (k - k_before) * dt_s, (k, robot.pose(k).copy()), k
+    before, k_before = (robot.poses[0], 0) if last is None else last[::-1]
+    since_s, carried.last, carried.walked = (k - k_before) * dt_s, (k, robot.poses[k].copy()), k
     if isinstance(of, Drifting) and (Q := of.drift(walked_s)).any():
         of = carried.sensor = of.with_parameters(of.parameters + chance.sight.normal(0.0, np.sqrt(Q)))  # type: ignore[attr-defined]
     counts = of.views != POSE and not sees_state(of, robot.motion)
@@ -465,7 +426,7 @@ def with_loop(
 
     That is the nearest of those that are kept, of which the robot has been farther since.  An id is its time.
     """
-    of, reach_m, here = carried.sensor, carried.sensing.loop_reach_m or 0.0, robot.pose(k)
+    of, reach_m, here = carried.sensor, carried.sensing.loop_reach_m or 0.0, robot.poses[k]
     d = len(here) // 3 + 1
     rows, ids = ([], []) if read is None else ([*read], list[Id | None]([None]))
     far = {j: float(np.linalg.norm(here[:d] - pose[:d])) for j, pose in carried.kept.items()}

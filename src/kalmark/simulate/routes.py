@@ -1,13 +1,12 @@
 """Routes of a simulated robot: a constant control, waypoints, a random walk between places, lanes; and the way along.
 
-`drive_leg` has one source: compiled for the motions of `CONTROLS`, as plain Python for all of them.
+`drive_leg` has one source: compiled for some `MOTIONS`, as plain Python for all of them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import cycle
 from typing import Annotated, Any, Literal
 
@@ -42,38 +41,19 @@ from kalmark.simulate.sights import correlated
 SLOW_S = 1.0  # in which a robot steered by impulses turns to its target
 REACHED_S = 0.2  # in which a robot of space turns to its target, and one that accelerates has its speed
 
-CONTROL = signature_of("f8[::1](f8[::1], f8, f8, f8)")
 STEER = signature_of("f8[::1](i8, f8[::1], f8[::1], f8[::1], UniTuple(f8, 2), f8)")
-DISTURB = signature_of("f8[::1](f8[::1], f8[::1], f8[::1])")
 WALK = signature_of("Tuple((f8[::1], i8))(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
-call_control, call_steer = by_address(CONTROL), by_address(STEER)
-call_disturb, call_walk = by_address(DISTURB), by_address(WALK)
+ERROR = signature_of("f8[::1](f8[::1], f8[::1])")
+call_steer, call_walk, call_error = by_address(STEER), by_address(WALK), by_address(ERROR)
 
-# what moves, steers and disturbs a robot, by address or as Python, and the parameters of the motion, of the error of a
-# control and of the random walk
-Ways = tuple[tuple[Any, Any, Any, Any, Any], tuple[Array, Array, Array]]
+# what moves and steers a robot, the error of a control and the random walk, by address or as Python, then the number of
+# the motion among `MOTIONS`; its parameters, the sigmas of a control (none: by the function) and those of the walk
+Ways = tuple[tuple[Any, Any, Any, Any, int], tuple[Array, Array, Array]]
+MOTIONS = (Unicycle, Odometry2D, Ackermann)  # driven in compiled code
 
 
-@dataclass
-class Course:
-    """What steers a robot: controls (steps, m), or a `target` (D,) and the places ahead.
-
-    `limits` are the speed in m/s and the tightest turn in m.
-    """
-
-    controls: Array
-    target: Array
-    limits: tuple[float, float]
-    ahead: Iterator[Array]
-
-    def aim(self, state: Array) -> None:
-        """Take the next place as the target where a state (size,) is near this one."""
-        for _ in range(1000):
-            if math.dist(self.target, state[: len(self.target)]) > 2 * self.limits[1]:
-                return
-            reached, self.target = self.target, next(self.ahead)
-            if np.array_equal(self.target, reached):  # there is no other: in an area of one landmark
-                return
+# controls (steps, m), or none and places (D,) to drive to, and the speed in m/s and the tightest turn in m
+Course = tuple[Array, Iterator[Array], tuple[float, float]]
 
 
 class Constant(Section):
@@ -97,7 +77,7 @@ class Constant(Section):
             ramp = max(0.5, min(self.ramp_s, self.drive_s / 2) / dt_s)
             shares = np.clip((np.arange(driven) + 0.5) / ramp, 0.0, 1.0)
             u = np.append(np.minimum(shares, shares[::-1]), np.zeros(stops))[:, None] * u
-        return Course(np.resize(u, (steps, len(self.u))), NOTHING, (0.0, 0.0), cycle([NOTHING]))
+        return np.resize(u, (steps, len(self.u))), cycle([NOTHING]), (0.0, 0.0)
 
 
 class Drive(Section):
@@ -114,8 +94,7 @@ class Drive(Section):
 
     def course(self, steps: int, dt_s: float, area: Array, rng: Generator) -> Course:
         """Return the course from place to place."""
-        places = self.places(area, rng)
-        return Course(np.zeros((0, 0)), next(places), (self.speed_mps, self.turn_radius_m), places)
+        return np.zeros((0, 0)), self.places(area, rng), (self.speed_mps, self.turn_radius_m)
 
 
 class Waypoints(Drive):
@@ -159,31 +138,42 @@ class Lanes(Drive):
 Route = Annotated[Any, OneOf(Constant, Waypoints, Wander, Lanes)]
 
 
-@compiled
-def unicycle_control(par: Array, v: float, w: float, dt_s: float) -> Array:
-    """Return the speed and the turn rate (2,)."""
-    return np.array([v, w])
+def aim(target: Array, ahead: Iterator[Array], reach_m: float, state: Array) -> Array:
+    """Return the target (D,), or the next one ahead that is out of reach of a state (size,)."""
+    for _ in range(1000):
+        if math.dist(target, state[: len(target)]) > reach_m:
+            break
+        reached, target = target, next(ahead)
+        if np.array_equal(target, reached):  # there is no other: in an area of one landmark
+            break
+    return target
 
 
 @compiled
-def increment_control(par: Array, v: float, w: float, dt_s: float) -> Array:
-    """Return the increment (3,) along an arc."""
-    a = 0.5 * w * dt_s
-    chord = v * dt_s * (math.sin(a) / a if a != 0.0 else 1.0)
-    return np.array([chord * math.cos(a), chord * math.sin(a), 2 * a])
+def turn_rate(r: Array, target: Array, limits: tuple[float, float], dt_s: float) -> float:
+    """Return the rate (rad/s) that turns a robot at r (3,) towards a target (2,) in `dt_s`, or as fast as it may."""
+    limit = limits[0] / limits[1]
+    error = wrap(math.atan2(target[1] - r[1], target[0] - r[0]) - r[2])
+    return min(limit, max(-limit, error / dt_s))
 
 
 @compiled
-def car_control(par: Array, v: float, w: float, dt_s: float) -> Array:
-    """Return the speed of the wheel and the steering angle (2,) of a car of the parameters `par` (2,)."""
+def control_in_plane(number: int, par: Array, v: float, w: float, dt_s: float) -> Array:
+    """Return the control (m,) of a motion among `MOTIONS`, with parameters `par`; see `control_of_velocity`."""
+    if number == 0:
+        return np.array([v, w])
+    if number == 1:
+        a = 0.5 * w * dt_s
+        chord = v * dt_s * (math.sin(a) / a if a != 0.0 else 1.0)
+        return np.array([chord * math.cos(a), chord * math.sin(a), 2 * a])
     tan = w * par[0] / v
     return np.array([v * (1.0 - tan * par[1] / par[0]), math.atan(tan)])
 
 
-CONTROLS: dict[type, Any] = {
-    Unicycle: unicycle_control, SlippingUnicycle: unicycle_control, Odometry2D: increment_control,
-    Ackermann: car_control,
-}  # fmt: skip
+@compiled
+def steer_in_plane(number: int, par: Array, r: Array, target: Array, limits: tuple[float, float], dt_s: float) -> Array:
+    """Return the control (m,) that turns a robot at r (3,) towards a target (2,) as fast as it may."""
+    return control_in_plane(number, par, limits[0], turn_rate(r, target, limits, dt_s), dt_s)
 
 
 def control_of_velocity(motion: Any, v: float, w: float, dt_s: float) -> Array:
@@ -197,17 +187,20 @@ def control_of_velocity(motion: Any, v: float, w: float, dt_s: float) -> Array:
     if isinstance(motion, DifferentialDrive):
         half = 0.5 * w * motion.track_m
         return np.array([(v - half) * dt_s / motion.left_radius_m, (v + half) * dt_s / motion.right_radius_m])
-    control = next(control for of, control in CONTROLS.items() if isinstance(motion, of))
-    return np.asarray(python_form(control)(motion.parameters, v, w, dt_s))
+    number = 0 if isinstance(motion, SlippingUnicycle) else [isinstance(motion, of) for of in MOTIONS].index(True)
+    return python_form(control_in_plane)(number, motion.parameters, v, w, dt_s)
 
 
-@compiled
-def steer_in_plane(
-    control: Any, par: Array, r: Array, target: Array, limits: tuple[float, float], dt_s: float
-) -> Array:
-    """Return the control (m,) that turns a robot at r (3,) towards a target (2,) as fast as it may."""
-    limit, error = limits[0] / limits[1], wrap(math.atan2(target[1] - r[1], target[0] - r[0]) - r[2])
-    return call_control(control, (par, limits[0], min(limit, max(-limit, error / dt_s)), dt_s))  # type: ignore[no-any-return]
+def steer(motion: Any, r: Array, target: Array, limits: tuple[float, float], dt_s: float) -> Array:
+    """Return the control (m,) that turns a robot at r (size,) towards a target (2,) or (3,) as fast as it may."""
+    if motion.space.world == "space":
+        return steer_in_space(motion, r, target, limits, dt_s)
+    columns = motion.columns
+    if not isinstance(motion, HasVelocity):
+        return control_of_velocity(motion, limits[0], python_form(turn_rate)(r, target, limits, dt_s), dt_s)
+    w = python_form(turn_rate)(r, target, limits, max(dt_s, SLOW_S))
+    change = np.array([limits[0], 0.0, w]) - motion.body_velocity(r)[0]  # by impulses
+    return change if len(columns) == 3 else change[[0, 2]]
 
 
 def steer_in_space(motion: Any, state: Array, target: Array, limits: tuple[float, float], dt_s: float) -> Array:
@@ -237,12 +230,6 @@ def control_in_space(motion: Any, state: Array, v: Array, w: Array, dt_s: float)
 
 
 @compiled
-def constant_errors(sigmas: Array, u: Array, z: Array) -> Array:
-    """Return the error (m,) of a control u (m,) from standard normal numbers z, by its sigmas (m,)."""
-    return sigmas * z[: len(sigmas)]
-
-
-@compiled
 def walk_in_plane(sigmas: Array, r: Array, u: Array, moved: Array, z: Array) -> tuple[Array, int]:
     """Return a pose (3,) that u (m,) moved, and walked at random by sigmas (3 or 0,) in its frame; and how many z."""
     if len(sigmas) == 0 or not u.any():
@@ -251,16 +238,13 @@ def walk_in_plane(sigmas: Array, r: Array, u: Array, moved: Array, z: Array) -> 
 
 
 def compiled_ways(motion: Any, dt_s: float) -> Ways:
-    """Return the addresses of a motion of the plane, one of `CONTROLS` whose noise is the same at all times."""
+    """Return the addresses of one of `MOTIONS`, whose noise does not depend on the control."""
     u = np.ones(len(motion.columns))
     D = motion.diffusion(u, dt_s)
-    calls = (
-        address_of(type(motion).moves, MOVE), address_of(steer_in_plane, STEER),
-        address_of(CONTROLS[type(motion)], CONTROL), address_of(constant_errors, DISTURB),
-        address_of(walk_in_plane, WALK),
-    )  # fmt: skip
-    sigmas = [np.sqrt(np.diagonal(cov)) for cov in (motion.control_noise(u), np.zeros((0, 0)) if D is None else D)]
-    return calls, (motion.parameters, sigmas[0], sigmas[1])
+    covs = motion.control_noise(u), np.zeros((0, 0)) if D is None else D
+    calls = address_of(type(motion).moves, MOVE), address_of(steer_in_plane, STEER), 0, address_of(walk_in_plane, WALK)
+    sigmas, walks = (np.sqrt(np.diagonal(cov)) for cov in covs)
+    return (*calls, MOTIONS.index(type(motion))), (motion.parameters, sigmas, walks)
 
 
 def python_ways(motion: Any, dt_s: float) -> Ways:
@@ -270,20 +254,9 @@ def python_ways(motion: Any, dt_s: float) -> Ways:
         D = diffusion_of(motion, r, u, dt_s)
         return (moved, 0) if D is None else (disturb_state(motion, moved, correlated(D, z[: len(D)])), len(D))
 
-    def impulse(control: Any, par: Array, r: Array, target: Array, limits: tuple[float, float], dt_s: float) -> Array:
-        wanted = turn_in_plane(lambda par, v, w, dt_s: np.array([v, 0.0, w]), par, r, target, limits, max(dt_s, SLOW_S))
-        change = wanted - motion.body_velocity(r)[0]
-        return change if len(motion.columns) == 3 else change[[0, 2]]
-
-    steer = turn_in_plane = python_form(steer_in_plane)
-    if motion.space.world == "space":
-        steer = lambda control, par, *where: steer_in_space(motion, *where)  # noqa: E731
-    elif isinstance(motion, HasVelocity):
-        steer = impulse
     calls = (
-        lambda r, u, par, dt_s: motion.move(r, u, dt_s), steer,
-        lambda par, *velocity: control_of_velocity(motion, *velocity),
-        lambda par, u, z: correlated(motion.control_noise(u), z[: len(u)]), walk,
+        lambda r, u, par, dt_s: motion.move(r, u, dt_s), lambda number, par, *where: steer(motion, *where),
+        lambda u, z: correlated(motion.control_noise(u), z), walk, -1,
     )  # fmt: skip
     return calls, (NOTHING, NOTHING, NOTHING)
 
@@ -293,23 +266,22 @@ def drive_leg(
     ways: Ways, course: tuple[Array, Array, tuple[float, float]], chance: tuple[Array, int], span: tuple[int, int],
     rules: tuple[float, bool], out: tuple[Array, Array, Array],
 ) -> tuple[int, int]:  # fmt: skip
-    """Drive through a span of steps, or until the target is near; return the step, and how many z are used.
+    """Drive through a span of steps, or until the target is reached; return the step, and how many z are used.
 
     `course` are the controls (steps, m), the target and the limits, `chance` standard normal numbers z and how many of
     them are used, `rules` the duration of a step and whether errors are the robot's.  Written are the states (steps +
     1, size), of which the first is given, the controls that the estimator is given, and those that are done (steps, m).
     """
-    ((move, steer, control, disturb, walk), par), (controls, target, limits), (z, at), (dt_s, on_robot) = (
-        ways, course, chance, rules,
-    )  # fmt: skip
-    states, told, done = out
+    (move, steering, error, walk, number), (par, sigmas, walks) = ways
+    (controls, target, limits), (z, at), (dt_s, on_robot), (states, told, done) = course, chance, rules, out
     for k in range(span[0], span[1]):
         r = states[k]
-        u = controls[k] if len(controls) else call_steer(steer, (control, par[0], r, target, limits, dt_s))
-        wrong = u + call_disturb(disturb, (par[1], u, z[at:]))
-        at += len(u)
+        u = controls[k] if len(controls) else call_steer(steering, (number, par, r, target, limits, dt_s))
+        drawn = z[at : at + len(u)]
+        wrong = u + (sigmas * drawn if len(sigmas) else call_error(error, (u, drawn)))
         told[k], done[k] = (u, wrong) if on_robot else (wrong, u)
-        moved, used = call_walk(walk, (par[2], r, done[k], call_move(move, (r, done[k], par[0], dt_s))[0], z[at:]))
+        at += len(u)
+        moved, used = call_walk(walk, (walks, r, done[k], call_move(move, (r, done[k], par, dt_s))[0], z[at:]))
         at += used
         states[k + 1] = moved
         far = 0.0

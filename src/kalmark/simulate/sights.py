@@ -7,7 +7,7 @@ of the image, but its noise is that of the sensor everywhere.  ([TB] adds it bef
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
@@ -35,7 +35,6 @@ Pair = Annotated[tuple[int, int], Field(strict=False)]
 POINTS, SEGMENTS, TAGS = "points", "segments", "tags"
 HERE = {2: np.zeros(3), 3: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 _LOOK = {3: Point2D(), 7: Point3D()}
-FALSE = 0  # no id
 _TRIES = 200  # places drawn for a false measurement before it is given up
 
 
@@ -50,7 +49,7 @@ class Sighted(NamedTuple):
     """Observations of a sensor, those of one step after those of another: at which `steps` (N,), in order.
 
     `ids` (N,) are reported, `real` (N,) those of what is really seen: a landmark's, -1, -2, ... for a robot by its
-    number, `FALSE` for nothing.  Then v (N, n) in the sensor's frame, measurements e (N, m), sizes of tags (N,).
+    number, 0 for nothing.  Then v (N, n) in the sensor's frame, measurements e (N, m), sizes of tags (N,).
     """
 
     steps: Index
@@ -63,11 +62,6 @@ class Sighted(NamedTuple):
     def rows(self, rows: Any) -> Sighted:
         """Return some of them."""
         return Sighted(*(part[rows] for part in self))
-
-
-def joined(parts: Iterable[Sighted]) -> Sighted:
-    """Return all of them."""
-    return Sighted(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 class SimulatedSensing(Section):
@@ -164,9 +158,9 @@ def points_in_reach(T: Array, points: Array, reach_m: float) -> tuple[Index, Ind
     That is the numbers of frames (N,) and of points (N,), and v (N, n), what is behind x and y unchanged.
     """
     places, origins = (p[:, 0] + 1j * p[:, 1] for p in (points, T))
-    seen = (places - origins[:, None]) * np.exp(-1j * T[:, 2:])
-    frames, numbers = np.nonzero(np.abs(seen) <= reach_m)
-    v = seen[frames, numbers]
+    d = places - origins[:, None]
+    frames, numbers = np.nonzero(d.real**2 + d.imag**2 <= reach_m**2)
+    v = d[frames, numbers] * np.exp(-1j * T[:, 2])[frames]
     return frames, numbers, np.column_stack([v.real, v.imag, points[numbers, 2:]])
 
 
@@ -270,26 +264,25 @@ def reported_rows(
     """
     distance = np.linalg.norm(centre(things.sort, seen.v, things.dimensions), axis=1)
     steps, near, at = seen.steps, seen.real - things.first, 0
-
-    def nearest(rows: Index) -> Index:
-        of = steps[rows]
-        rank = np.arange(len(rows)) - np.searchsorted(of, of)
-        return np.sort(rows[np.lexsort((distance[rows], of))[rank < (max_per_scan or len(rows))]])
-
+    rows = np.arange(len(steps))
+    if max_per_scan is not None:
+        rows = np.sort(np.lexsort((distance, steps))[rows - np.searchsorted(steps, steps) < max_per_scan])
     if new_per_step is None:
-        yield nearest(np.arange(len(steps)))
+        yield rows
         return
     while at < len(steps):
         unseen = np.flatnonzero(~things.seen[near[at:]])
         k = steps[at + unseen[0]] if len(unseen) else steps[-1] + 1
         here, then = np.searchsorted(steps, (k, k + 1)).tolist()
-        yield nearest(np.arange(at, here))
-        known = things.seen[near[here:then]]
-        new = rng.permutation(here + np.flatnonzero(~known))[:new_per_step]
-        rows = nearest(np.union1d(here + np.flatnonzero(known), new))
-        things.seen[near[rows]] = True
-        yield rows
+        yield rows[slice(*np.searchsorted(rows, (at, here)))]
         at = then
+        if then > here:
+            known = things.seen[near[here:then]]
+            new = rng.permutation(here + np.flatnonzero(~known))[:new_per_step]
+            told = np.union1d(here + np.flatnonzero(known), new)
+            told = np.sort(told[np.argsort(distance[told], kind="stable")[:max_per_scan]])
+            things.seen[near[told]] = True
+            yield told
 
 
 def report_with_faults(
@@ -303,7 +296,7 @@ def report_with_faults(
         wrong = late[rng.random(len(late)) < sensing.outliers]
         reach_m = min(range_limit(sensor), things.extent())
         found, y = false_measurements(sensor, seen.v[wrong], seen.sizes[wrong], reach_m, rng)
-        seen.e[wrong[found]], seen.real[wrong[found]] = y[found], FALSE
+        seen.e[wrong[found]], seen.real[wrong[found]] = y[found], 0
     told, kept = seen.ids[late], np.ones(len(seen.ids), dtype=np.bool_)
     kept[late] = (rng.random(len(late)) >= (sensing.dropouts or 0.0)) & ~np.isin(told, sensing.hidden)
     for name, other in dict([*sensing.swapped, *((b, a) for a, b in sensing.swapped)]).items():
@@ -322,7 +315,10 @@ def false_measurements(sensor: Any, v: Array, sizes: Array, reach_m: float, rng:
         missing = np.flatnonzero(~found)
         if not len(missing):
             break
-        places = in_ball(len(missing), 2 if plane else 3, reach_m, rng)
+        d = 2 if plane else 3
+        places = rng.standard_normal((len(missing), d))  # uniform in a ball: of any direction first
+        places /= np.linalg.norm(places, axis=1, keepdims=True)
+        places *= reach_m * rng.uniform(0.0, 1.0, (len(missing), 1)) ** (1.0 / d)
         moved = v[missing].copy()
         if sort == SEGMENTS:
             shift = places - centre(sort, moved, places.shape[1])
@@ -332,13 +328,6 @@ def false_measurements(sensor: Any, v: Array, sizes: Array, reach_m: float, rng:
         inside, y = exact_measurements(sensor, moved, sizes[missing])
         found[missing], e[missing[inside]] = inside, y[inside]
     return found, e
-
-
-def in_ball(count: int, dimensions: int, radius: float, rng: Generator) -> Array:
-    """Return points (count, dimensions) uniform in a ball about the origin."""
-    direction = rng.standard_normal((count, dimensions))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return radius * rng.uniform(0.0, 1.0, (count, 1)) ** (1.0 / dimensions) * direction
 
 
 def tags_seen(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
