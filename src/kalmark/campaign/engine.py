@@ -125,13 +125,14 @@ def by_landmark(count: int, steps: Index, numbers: Index, places: Array, y: Arra
     That is where each step begins (count + 1,), where its new ones do (count,), the places of landmarks in the state
     (N,), y (N, 2) and where the landmarks are (L, 2), in the order in which they are seen first.
     """
-    _, first, found = np.unique(numbers, return_index=True, return_inverse=True)
-    new, place = np.zeros(len(numbers), np.bool_), np.argsort(np.argsort(first)) + 1
-    new[first] = True
+    first, place = np.zeros((2, numbers.max(initial=0) + 1), np.int64)
+    first[numbers[::-1]] = np.arange(len(numbers))[::-1]  # the last one that is written
+    new = first[numbers] == np.arange(len(numbers))
+    place[numbers[new]] = np.arange(np.count_nonzero(new)) + 1
     rows = np.lexsort((new, steps))
     begins = np.searchsorted(steps, np.arange(count + 1))
     middle = begins[1:] - np.bincount(steps[new], minlength=count)
-    return begins, middle, place[found][rows], y[rows], places[new]
+    return begins, middle, place[numbers[rows]], y[rows], places[new]
 
 
 # ---------------------------------------------------------------------- filter

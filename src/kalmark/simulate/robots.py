@@ -346,7 +346,7 @@ def sight(
     seen = visible(carried, robot, robots, there, world, steps)
     landmarks = np.count_nonzero(seen.real > 0)
     groups: Iterable[Index] = sights.reported_rows(
-        there, seen.rows(slice(landmarks)), world.new_per_step, world.max_per_scan, chance.sight
+        there, Sighted(*(part[:landmarks] for part in seen)), world.new_per_step, world.max_per_scan, chance.sight
     )
     if landmarks < len(seen.real):
         groups = [np.concatenate([*groups, np.arange(landmarks, len(seen.real))])]
@@ -378,7 +378,7 @@ def visible(
             v = np.column_stack([v, np.tile(t, (len(v), 1))])
     sizes, ids = np.append(there.sizes[near], 0.0 * others), np.append(near + there.first, -1 - others)
     inside, e = sights.exact_measurements(sensor, v, sizes)
-    return Sighted(steps[of], ids, ids, v, e, sizes).rows(inside)
+    return Sighted(steps[of], ids, ids, v, e, sizes).rows(np.flatnonzero(inside))
 
 
 def raw_of(robot: SimRobot, name: str, k: int, t_ns: int, chance: Chance) -> Raw:

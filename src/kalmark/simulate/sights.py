@@ -59,9 +59,9 @@ class Sighted(NamedTuple):
     e: Array
     sizes: Array
 
-    def rows(self, rows: Any) -> Sighted:
+    def rows(self, rows: Index) -> Sighted:
         """Return some of them."""
-        return Sighted(*(part[rows] for part in self))
+        return Sighted(*(part.take(rows, axis=0) for part in self))
 
 
 class SimulatedSensing(Section):
@@ -301,7 +301,7 @@ def report_with_faults(
     kept[late] = (rng.random(len(late)) >= (sensing.dropouts or 0.0)) & ~np.isin(told, sensing.hidden)
     for name, other in dict([*sensing.swapped, *((b, a) for a, b in sensing.swapped)]).items():
         seen.ids[late[told == name]] = other
-    return seen.rows(kept)
+    return seen.rows(np.flatnonzero(kept))
 
 
 def false_measurements(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generator) -> tuple[Flags, Array]:
