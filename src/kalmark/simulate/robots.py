@@ -344,9 +344,10 @@ def sight(
     """Yield what a sensor of landmarks reports at some steps, with noise and faults, all of a step at once."""
     sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
     seen = visible(carried, robot, robots, there, world, steps)
+    parts: tuple[Any, ...] = seen
     landmarks = np.count_nonzero(seen.real > 0)
     groups: Iterable[Index] = sights.reported_rows(
-        there, Sighted(*(part[:landmarks] for part in seen)), world.new_per_step, world.max_per_scan, chance.sight
+        there, Sighted(*(part[:landmarks] for part in parts)), world.new_per_step, world.max_per_scan, chance.sight
     )
     if landmarks < len(seen.real):
         groups = [np.concatenate([*groups, np.arange(landmarks, len(seen.real))])]

@@ -61,7 +61,8 @@ class Sighted(NamedTuple):
 
     def rows(self, rows: Index) -> Sighted:
         """Return some of them."""
-        return Sighted(*(part.take(rows, axis=0) for part in self))
+        parts: tuple[Any, ...] = self
+        return Sighted(*(part.take(rows, axis=0) for part in parts))
 
 
 class SimulatedSensing(Section):
