@@ -312,12 +312,15 @@ class _CompilationListener(event.Listener):  # type: ignore[misc, unused-ignore]
 event.register("numba:compile", _CompilationListener())
 
 
-def by_address(signature: Signature) -> Callable[[int, tuple[Any, ...]], Any]:
-    """Return a function that calls what is at an address with a tuple of arguments, from compiled code or Python."""
+def by_address(signature: Signature) -> Callable[[Any, tuple[Any, ...]], Any]:
+    """Return a function that calls what is at an address with a tuple of arguments, from compiled code or Python.
+
+    In Python a function may stand for its address.
+    """
     arguments_type = types.Tuple(signature.args)
 
-    def call(address: int, arguments: tuple[Any, ...]) -> Any:
-        return _FUNCTIONS[address](*arguments)
+    def call(address: Any, arguments: tuple[Any, ...]) -> Any:
+        return _FUNCTIONS.get(address, address)(*arguments)
 
     @intrinsic  # type: ignore[untyped-decorator]
     def compiled_call(context: Any, address: Any, arguments: Any) -> Any:

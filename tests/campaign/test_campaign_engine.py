@@ -58,6 +58,15 @@ CASES: dict[str, tuple[str, list[str]]] = {
         ),
         [],
     ),
+    "hidden landmarks": ("cloister", ["steps=60", "robots.robot.sensing={lidar: {dropouts: 0.1, hidden: [3]}}"]),
+    "stops of the robot": (
+        "loop_b2", ["steps=200", "robots.robot.route={type: constant, u: [0.25, 0, 0.025], stop_s: 3.0, ramp_s: 1.0}"],
+    ),
+    "stops without noise": (
+        "loop_b2",
+        ["steps=200", "noise_on=robot", "robots.robot.motion.sigma_along_m_per_sqrt_s=0.01",
+         "robots.robot.route={type: constant, u: [0.25, 0, 0.025], stop_s: 3.0}"],
+    ),
 }  # fmt: skip
 
 
@@ -106,12 +115,6 @@ def test_a_run_has_the_numbers_of_the_ordinary_path(case: str, tmp_path: Path) -
         ("cloister", ["robots.robot.sensing={lidar: {outliers: 0.1}}"], "invariant", "no outliers"),
         ("cloister", ["filter={landmarks: {type: polar}}"], "invariant", "points with known ids"),
         ("cloister", ["filter={map: {type: postponed}}"], "invariant", "dense maps"),
-        (
-            "loop_b2",
-            ["robots.robot.route={type: constant, u: [0.25, 0.0, 0.025], stop_s: 3.0}"],
-            "invariant",
-            "stands still",
-        ),
     ],
 )
 def test_what_the_engine_does_not_run_is_said(name: str, overrides: list[str], estimator: str, why: str) -> None:

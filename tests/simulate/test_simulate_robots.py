@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-import kalmark as km
 from kalmark.events import Control, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose, scan_many, to_frame_many
 from kalmark.logs.log import Log
 from kalmark.simulate import load_world, simulate
 from kalmark.simulate.robots import simulation
-from kalmark.simulate.routes import Wander
+from kalmark.simulate.routes import Wander, aim
 from kalmark.simulate.sights import gaussian
 
 
@@ -212,8 +211,7 @@ def test_a_constant_route_accelerates_evenly_after_a_stop_and_before_the_next() 
     drive = load_world(
         "stop_and_go", ["robots.rover.route={type: constant, u: [0.5, 0.1], drive_s: 1.0, stop_s: 0.2, ramp_s: 0.4}"]
     )
-    driver = drive.robots["rover"].route.driver(None, 0.1, np.zeros((2, 2)), np.random.default_rng(0))
-    told = np.array([driver(np.zeros(3)) for _ in range(24)])
+    told = drive.robots["rover"].route.course(24, 0.1, np.zeros((2, 2)), np.random.default_rng(0))[0]
     np.testing.assert_allclose(
         told[:12, 0], 0.5 * np.array([0.125, 0.375, 0.625, 0.875, 1, 1, 0.875, 0.625, 0.375, 0.125, 0, 0])
     )
@@ -231,7 +229,8 @@ def test_a_robot_with_one_place_to_go_to_does_not_ask_for_others_again_and_again
                 yield place
 
     area = np.array([[2.0, 3.0], [2.0, 3.0]])  # of one landmark
-    drive = Counted(turn_radius_m=8.0).driver(km.motion.Unicycle(), 0.1, area, np.random.default_rng(0))
+    _, ahead, (_, turn_radius_m) = Counted(turn_radius_m=8.0).course(10, 0.1, area, np.random.default_rng(0))
+    target = next(ahead)
     for _ in range(10):
-        drive(np.array([1.0, 3.0, 0.2]))
+        target = aim(target, ahead, 2 * turn_radius_m, np.array([1.0, 3.0, 0.2]))
     assert len(asked) <= 11

@@ -1,23 +1,21 @@
-"""The batched engine: runs of one world in compiled code, simulated, filtered and scored without Python in a step.
+"""The batched engine: runs of one world, filtered and scored in compiled code without Python in a step.
 
-A run has the numbers of the ordinary path (`simulation`, `score`) up to rounding.  The random numbers are those of the
-simulator, drawn in its order, many at a time.  The filter calls the compiled prediction and correction that
-`Slam.process` calls, by their addresses.  `refusal` has the reasons why the engine does not run a world; a run that it
-cannot finish, such as one whose filter diverges, is left to the ordinary path, too.
+A run has the numbers of the ordinary path (`simulation`, `score`) up to rounding.  The simulator is the same, its robot
+driven in compiled code.  The filter calls the compiled prediction and correction that `Slam.process` calls, by their
+addresses.  `refusal` has the reasons why the engine does not run a world; a run that it cannot finish, such as one
+whose filter diverges, is left to the ordinary path, too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from functools import cached_property
-from itertools import islice
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.random import SeedSequence
 
-from kalmark.arrays import Array, Flags, Index
+from kalmark.arrays import Array, Index
 from kalmark.association import ByIdentity
 from kalmark.campaign.scoring import SERIES, Scores, scores_of
 from kalmark.compiled import address_of, by_address, compiled, signature_of
@@ -31,22 +29,16 @@ from kalmark.geometry.frames import compose, from_frame_many, inv_scan_many
 from kalmark.geometry.spaces import HEADING, VECTOR, Table
 from kalmark.management.attention import EVERYTHING
 from kalmark.models.landmarks import Point2D
-from kalmark.models.motion import Ackermann, Odometry2D, Unicycle
-from kalmark.models.observe import call_move, step_of
+from kalmark.models.observe import step_of
 from kalmark.models.protocols import parameter_covariance, self_calibrating
 from kalmark.models.sensors import RangeBearing
 from kalmark.results.measures import MAP_NEES, log_translation, map_nees
-from kalmark.simulate.robots import Chance, draw_start, scenery_of
-from kalmark.simulate.routes import Constant, Drive
-from kalmark.simulate.sights import POINTS, SimulatedSensing, Things, is_reportable, noisy_measurements, select_reported
+from kalmark.simulate.robots import Chance, drive_all, scenery_of, sight, spans
+from kalmark.simulate.routes import MOTIONS, compiled_ways
+from kalmark.simulate.sights import POINTS, Sighted
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
-
-MOTIONS = (Unicycle, Odometry2D, Ackermann)
-ALL_TARGETS = 100  # places to drive to, a step, before a run is left to the ordinary path
-
-NO_CONTROL = np.zeros(0)  # the noise of controls does not depend on them
 
 PREDICT = signature_of(
     "b1(Tuple((f8[::1], f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8)), "
@@ -60,7 +52,6 @@ call_predict, call_correct = by_address(PREDICT), by_address(CORRECT)
 
 # of ranges and bearings: sigma_range_m, sigma_range_rel, sigma_bearing_rad, scale and bias_m
 Noise = tuple[float, float, float, float, float]
-InSight = tuple[Index, Index, Array, Array]  # as `visible_points` returns
 Sightings = tuple[Index, Index, Index, Array, Array]  # as `by_landmark` returns
 
 
@@ -75,15 +66,10 @@ def refusal(world: Any, configs: Mapping[str, Config]) -> str:
     if len(simulated.sensors) != 1:
         return "the batched engine runs one sensor"
     robot = build_robot(world.models(), name)
-    ((key, mount),) = robot.sensors.items()
+    (mount,) = robot.sensors.values()
     why = _odd_models(robot.motion, mount)
-    sensing = simulated.sensing.get(key, SimulatedSensing())
-    if not why and (sensing.outliers or sensing.swapped or sensing.hidden):
-        why = "the batched engine simulates no outliers, swapped or hidden ids"
-    if not why and not isinstance(simulated.route, Constant | Drive):
-        why = f"the batched engine does not drive a {type(simulated.route).__name__}"
-    if not why and isinstance(simulated.route, Constant) and (simulated.route.stop_s or not any(simulated.route.u)):
-        why = "the batched engine has no robot that stands still"
+    if not why and any(sensing.outliers or sensing.swapped for sensing in simulated.sensing.values()):
+        why = "the batched engine has no outliers and no swapped ids: it rejects nothing"
     if not why and not world.ids:
         why = "the batched engine needs known ids"
     things = scenery_of(world, np.random.default_rng(0))
@@ -100,6 +86,7 @@ def _odd_models(motion: Any, mount: Mount) -> str:
         type(mount.sensor) is not RangeBearing
         or parameter_covariance(mount.sensor) is not None
         or mount.cov is not None
+        or mount.detector is not None
     ):
         return "the batched engine has ranges and bearings, of a sensor whose calibration is known"
     return ""
@@ -122,7 +109,7 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
     is_gated = policy.association.threshold(channel.dof, math.inf) < math.inf
     if channel.robust is not None or is_gated or (robot.max_speed_mps, robot.max_turn_radps) != (None, None):
         return "the batched engine has no robust weights, no gate that is set, and no limits of its robot"
-    plain = mount.attention == EVERYTHING and mount.detector is None and mount.initialization is None
+    plain = mount.attention == EVERYTHING and mount.initialization is None
     if not plain or policy.upkeep.p_detect is not None:
         return "the batched engine uses all that is seen, and keeps it"
     kind = slam.state.settings.map
@@ -131,158 +118,21 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
     return ""
 
 
-# ---------------------------------------------------------------------- simulation
-@compiled
-def drive_route(
-    model: tuple[int, Array], kind: int, start: Array, dt_s: float, errors: Array, walk: Array, u: Array, places: Array,
-    limits: tuple[float, float], on_robot: bool,
-) -> tuple[Array, Array, bool]:  # fmt: skip
-    """Drive to `places` (T, 2), or by a constant control u (m,); return states (steps + 1, 3) and noisy controls.
-
-    `errors` (steps, m) are those of the controls, `walk` (steps, 3 or 0) is the diffusion in the robot's frame; `kind`
-    is the motion's number among `MOTIONS`, `limits` speed and turning radius.  The last answer is whether the places
-    were enough.  As `simulate.robots.step_robot` and `simulate.routes`.
-    """
-    steps, m = errors.shape
-    speed, radius = limits
-    states, told, control, done = np.empty((steps + 1, 3)), np.empty((steps, m)), np.empty(m), np.empty(m)
-    r, at = start.copy(), 0
-    states[0] = r
-    for k in range(steps):
-        for j in range(len(u)):
-            control[j] = u[j]
-        if len(u) == 0:
-            for _ in range(1000):
-                if math.hypot(places[at, 0] - r[0], places[at, 1] - r[1]) > 2 * radius:
-                    break
-                at += 1
-                if at == len(places):
-                    return states, told, False
-            error = wrap(math.atan2(places[at, 1] - r[1], places[at, 0] - r[0]) - r[2])
-            limit = speed / radius
-            w = min(limit, max(-limit, error / dt_s))
-            if kind == 0:
-                control[0], control[1] = speed, w
-            elif kind == 1:
-                a = 0.5 * w * dt_s
-                chord = speed * dt_s * (math.sin(a) / a if a != 0.0 else 1.0)
-                control[0], control[1], control[2] = chord * math.cos(a), chord * math.sin(a), 2 * a
-            else:
-                tan = w * model[1][0] / speed
-                control[0], control[1] = speed * (1.0 - tan * model[1][1] / model[1][0]), math.atan(tan)
-        for j in range(m):
-            disturbed = control[j] + errors[k, j]
-            told[k, j], done[j] = (control[j], disturbed) if on_robot else (disturbed, control[j])
-        r = call_move(model[0], (r, done, model[1], dt_s))[0]
-        if walk.shape[1] == 3:
-            c, s = math.cos(r[2]), math.sin(r[2])
-            r[0], r[1] = r[0] + (c * walk[k, 0] - s * walk[k, 1]), r[1] + (s * walk[k, 0] + c * walk[k, 1])
-            r[2] = wrap(r[2] + walk[k, 2])
-        states[k + 1] = r
-    return states, told, True
-
-
-@compiled
-def visible_points(
-    states: Array, at: Array, points: Array, scans: Index, limits: tuple[float, float, float]
-) -> InSight:
-    """Return the points in view of a sensor at `at` (3,): steps (N,) of `scans`, points (N,) and distances (N,).
-
-    Last is where the points are in the sensor's frame (N, 2).  `limits` are the least and the greatest range and half
-    of the field of view.
-    """
-    least, greatest, half = limits
-    most, total = len(scans) * len(points), 0
-    steps, numbers = np.empty(most, np.int64), np.empty(most, np.int64)
-    distance, v = np.empty(most), np.empty((most, 2))
-    for k in scans:
-        T = compose(states[k + 1], at)[0]
-        c, s = math.cos(T[2]), math.sin(T[2])
-        for i in range(len(points)):
-            d_x, d_y = points[i, 0] - T[0], points[i, 1] - T[1]
-            x, y = c * d_x + s * d_y, c * d_y - s * d_x
-            away = math.sqrt(x * x + y * y)
-            if least <= away <= greatest and (half >= math.pi or abs(math.atan2(y, x)) <= half):
-                steps[total], numbers[total], distance[total], v[total, 0], v[total, 1] = k, i, away, x, y
-                total += 1
-    return steps[:total], numbers[:total], distance[:total], v[:total]
-
-
-@compiled
-def select_nearest(steps: Index, distance: Array, most: int) -> Flags:
-    """Return which of what is seen, at `steps` (N,) in order, is among the `most` nearest of its step.
-
-    Of those that are as near, the first.
-    """
-    near, first, last = np.empty(len(steps), np.bool_), 0, 0
-    for i in range(len(steps)):
-        if i == last:
-            first, last = i, np.searchsorted(steps, steps[i], side="right")
-        nearer = 0
-        for j in range(first, last):
-            nearer += (distance[j] < distance[i]) | ((distance[j] == distance[i]) & (j < i))
-        near[i] = nearer < most
-    return near
-
-
-def reported_observations(
-    world: World, sensing: SimulatedSensing, things: Things, sensor: RangeBearing, chance: Chance, seen: InSight
-) -> Sightings:
-    """Return the reported, noisy part of all visible points: from `select_reported` to `is_reportable`."""
-    steps, numbers, _, v = seen
-    rows, measured = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
-    for kept in reports(world, things, seen, chance):
-        if sensing.dropouts:
-            late = steps[kept] + 1 >= sensing.faults_from_step
-            lost = np.zeros(len(kept), dtype=np.bool_)
-            lost[late] = chance.faults.random(int(late.sum())) < sensing.dropouts
-            kept = kept[~lost]  # noqa: PLW2901
-        rows.append(kept)
-        measured.append(noisy_measurements(sensor, sensor.expect(v[kept])[0], chance.sight))
-    of, y = np.concatenate(rows), np.concatenate(measured)
-    there = is_reportable(sensor, y)
-    return by_landmark(world.steps, steps[of[there]], things.values, numbers[of[there]], y[there])
-
-
-def by_landmark(count: int, steps: Index, points: Array, numbers: Index, y: Array) -> Sightings:
-    """Return measurements y (N, 2) of points at `count` steps, in each step those of new landmarks last.
+# ---------------------------------------------------------------------- sightings
+def by_landmark(count: int, steps: Index, numbers: Index, places: Array, y: Array) -> Sightings:
+    """Return measurements y (N, 2) of points at `places` (N, 2) in `count` steps, in each those of new landmarks last.
 
     That is where each step begins (count + 1,), where its new ones do (count,), the places of landmarks in the state
     (N,), y (N, 2) and where the landmarks are (L, 2), in the order in which they are seen first.
     """
-    found, first = np.unique(numbers, return_index=True)
-    order, place, new = found[np.argsort(first)], np.zeros(len(points), np.int64), np.zeros(len(numbers), np.bool_)
-    place[order], new[first] = np.arange(len(order)) + 1, True
+    first, place = np.zeros((2, numbers.max(initial=0) + 1), np.int64)
+    first[numbers[::-1]] = np.arange(len(numbers))[::-1]  # the last one that is written
+    new = first[numbers] == np.arange(len(numbers))
+    place[numbers[new]] = np.arange(np.count_nonzero(new)) + 1
     rows = np.lexsort((new, steps))
     begins = np.searchsorted(steps, np.arange(count + 1))
     middle = begins[1:] - np.bincount(steps[new], minlength=count)
-    return begins, middle, place[numbers[rows]], y[rows], points[order]
-
-
-def reports(world: World, things: Things, seen: InSight, chance: Chance) -> Iterator[Index]:
-    """Yield rows of what is seen that are reported, many steps at once: alone are those that start new landmarks.
-
-    These draw from the same source of chance as the noise does.
-    """
-    steps, numbers, distance, _ = seen
-    rows, at = np.arange(len(steps)), 0
-    if world.max_per_scan is not None:
-        rows = rows[select_nearest(steps, distance, world.max_per_scan)]
-    if world.new_per_step is None:
-        yield rows
-        return
-    while at < len(steps):
-        unseen = np.flatnonzero(~things.seen[numbers[at:]])
-        k = steps[at + unseen[0]] if len(unseen) else world.steps
-        here, then = np.searchsorted(steps, (k, k + 1)).tolist()
-        yield rows[slice(*np.searchsorted(rows, (at, here)))]
-        if then > here:
-            some = slice(here, then)
-            told = select_reported(
-                things, numbers[some], distance[some], world.new_per_step, world.max_per_scan, chance.sight
-            )
-            yield here + told
-        at = then
+    return begins, middle, place[numbers[rows]], y[rows], places[new]
 
 
 # ---------------------------------------------------------------------- filter
@@ -441,18 +291,14 @@ class _Filter:
         self.capacity = capacity_for(3 + 2 * landmarks)
         cov = np.zeros((3, 3)) if robot.cov is None else np.asarray(robot.cov)
         self.start = np.array(robot.start), np.array(cov)
-        self.control = motion.control_noise(NO_CONTROL), density_of(motion), motion.held
+        u = np.ones(len(motion.columns))
+        D = motion.diffusion(u, 1.0)
+        self.control = motion.control_noise(u), np.zeros((0, 0)) if D is None else D, motion.held
         s = mount.sensor
         self.sensed = np.array(mount.at), (s.sigma_range_m, s.sigma_range_rel, s.sigma_bearing_rad, s.scale, s.bias_m)
         limits = (estimator.iterations, float(estimator.tolerance)) if isinstance(estimator, Invariant) else (1, 0.0)
         self.rules = (float(channel.gate), *limits)
         self.coordinates = estimator.coordinates
-
-
-def density_of(motion: Any) -> Array:
-    """Return the diffusion of a motion that moves, (3, 3) a second; (0, 0) if it has none."""
-    D: Array | None = motion.diffusion(np.ones(len(motion.columns)), 1.0)
-    return np.zeros((0, 0)) if D is None else D
 
 
 def capacity_for(rows: int) -> int:
@@ -464,75 +310,36 @@ class Engine:
     """Runs of a world under several filters.  Made once for many runs: it compiles, or loads, what they call."""
 
     def __init__(self, world: World, configs: Mapping[str, Config]) -> None:
-        self.world, self.times = world, world.times()
-        ((name, simulated),) = world.robots.items()
-        self.robot, self.route = build_robot(world.models(), name), simulated.route
-        ((key, self.mount),) = self.robot.sensors.items()
-        self.sensing = simulated.sensing.get(key, SimulatedSensing()).of(simulated.sensors[key], world.dt_s)
-        things = scenery_of(world, np.random.default_rng(0))
-        self.landmarks = len(things[POINTS].values)
+        self.world = world
+        (name,) = world.robots
+        self.robot = build_robot(world.models(), name)
+        self.landmarks = len(scenery_of(world, np.random.default_rng(0))[POINTS].values)
         self.filters = {label: _Filter(build_slam(c), name, self.landmarks) for label, c in configs.items()}
-        motion, sensor = self.robot.motion, self.mount.sensor
-        self.motion, self.kind = step_of(motion), MOTIONS.index(type(motion))
-        assert isinstance(motion, MOTIONS) and isinstance(sensor, RangeBearing)
-        self.scans = np.flatnonzero([*map(self.sensing.scans_at, range(1, world.steps + 1))])
-        self.at, self.sensor = np.array(self.mount.at), sensor
-        self.limits = sensor.range_min_m, sensor.range_max_m, sensor.fov_rad / 2
+        self.ways = compiled_ways(self.robot.motion, world.dt_s)
+        self.seconds = np.diff([0, *world.times()]) * 1e-9  # of each control: an increment's first has none before it
+        self.seconds[0] *= self.robot.motion.held
 
     def run(self, seed: SeedSequence, map_every: int) -> dict[str, Scores] | None:
         """Simulate and score one run under every filter; None if that is left to the ordinary path."""
         world, chance = self.world, Chance(seed)
-        things = scenery_of(world, chance.layout)[POINTS]
-        if len(things.values) != self.landmarks:
+        (robot,), things = drive_all(world, [self.robot], chance, self.ways)
+        (carried,), points = robot.sensors.values(), things[POINTS].values
+        parts = [
+            part
+            for steps in spans(world, [robot], things)
+            for part in sight(carried, robot, [robot], things, world, steps[carried.sensing.scans_at(steps)], chance)
+        ]
+        if len(points) != self.landmarks or not parts:
             return None
-        driven_ = self._drive(things, chance)
-        if driven_ is None:
-            return None
-        states, u = driven_
-        seen = visible_points(states, self.at, things.values, self.scans, self.limits)
-        sightings = reported_observations(world, self.sensing, things, self.sensor, chance, seen)
+        seen = Sighted(*map(np.concatenate, zip(*parts, strict=True)))
+        sightings = by_landmark(world.steps, seen.steps - 1, seen.ids, points[seen.ids - 1], seen.e)
         scores = {}
         for label, one in self.filters.items():
-            score = self._filter(one, states, u, sightings, map_every)
+            score = self._filter(one, robot.states, robot.told, sightings, map_every)
             if score is None:
                 return None
             scores[label] = score
         return scores
-
-    def _drive(self, things: Things, chance: Chance) -> tuple[Array, Array] | None:
-        """Return the true states (steps + 1, 3) and the controls (steps, m) that the filters are given."""
-        world, motion = self.world, self.robot.motion
-        state = draw_start(self.robot, chance.route)
-        walks = np.diagonal(density_of(motion) * world.dt_s)
-        variances = np.append(np.diagonal(motion.control_noise(NO_CONTROL)), walks)
-        draws = np.sqrt(variances) * chance.control.standard_normal((world.steps, len(variances)))
-        m, route = len(motion.columns), self.route
-        told, walk = np.ascontiguousarray(draws[:, :m]), np.ascontiguousarray(draws[:, m:])
-        u, places, limits = np.zeros(0), np.zeros((0, 2)), (0.0, 1.0)
-        area = np.array([things.values.min(axis=0), things.values.max(axis=0)])
-        ahead: Iterator[Array] = iter(())
-        if isinstance(route, Constant):
-            u = np.array(route.u)
-        else:
-            limits, ahead = (route.speed_mps, route.turn_radius_m), route.places(area, chance.route)
-        while True:
-            more = max(64, len(places)) if not len(u) else 0
-            places = np.concatenate([places, np.reshape([p[:2] for p in islice(ahead, more)], (-1, 2))])
-            on_robot = world.noise_on == "robot"
-            args = self.motion, self.kind, state, world.dt_s, told, walk, u, places, limits, on_robot
-            states, controls, enough = drive_route(*args)
-            if enough:
-                return states, controls
-            if len(places) > ALL_TARGETS * world.steps:
-                return None
-
-    @cached_property
-    def _seconds(self) -> Array:
-        """The seconds (steps,) of each control: an increment's first one has none before it."""
-        dt_s = np.diff([0, *self.times]) * 1e-9
-        if not self.robot.motion.held:
-            dt_s[0] = 0.0
-        return dt_s
 
     def _filter(self, f: _Filter, states: Array, u: Array, sightings: Sightings, map_every: int) -> Scores | None:
         """Filter and score a run; None if the filter diverges."""
@@ -540,7 +347,7 @@ class Engine:
         scored = map_every, f.coordinates == "log", states
         ok, mean, P, of_map, x, nis, fused = filter_run(
             f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
-            (u, self._seconds, N, density, held), sightings, f.sensed, f.rules, scored,
+            (u, self.seconds, N, density, held), sightings, f.sensed, f.rules, scored,
         )  # fmt: skip
         if not ok:
             return None

@@ -41,11 +41,11 @@ from kalmark.simulate.robots import (
     Key,
     Simulation,
     add_diffusion,
-    body_axes,
     draw_mount,
     draw_start,
     given_control,
 )
+from kalmark.simulate.routes import body_axes
 from kalmark.simulate.sights import (
     POINTS,
     exact_measurements,

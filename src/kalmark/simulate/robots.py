@@ -9,20 +9,18 @@ biases, scales, radii.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.random import Generator, SeedSequence
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Index
+from kalmark.compiled import python_form
 from kalmark.config.building import build_robot
 from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.events import Control, Event, Id, Raw, Scan, seconds_text, sort_key
-from kalmark.geometry.angles import rotation
-from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import landmark_id
@@ -35,7 +33,6 @@ from kalmark.models.protocols import (
     SeesVelocity,
     TimedNoise,
     coasts,
-    diffusion_of,
     parameter_covariance,
     poses_kept,
     range_limit,
@@ -47,12 +44,14 @@ from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, velocity_of, view_of_state
 from kalmark.simulate import laser, sights
 from kalmark.simulate.layouts import Scenery
-from kalmark.simulate.routes import Driver
+from kalmark.simulate.routes import Course, Ways, aim, disturb_state, drive_leg, python_ways
 from kalmark.simulate.sights import POINTS, Sighted, SimulatedSensing, Things, gaussian, things_in_frame
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
 
 Key = tuple[int, str, str]
+Found = tuple[int, str, Array, list[Id | None] | None, tuple[Id | None, ...]]  # step, sensor, y, ids and origins
+AT_ONCE = 2**14  # observations of landmarks, seen or not, that are made at once
 ROUNDS = 10  # of a fixed point: a constant changes a control by some percent
 WILD = 30.0  # by so many of its own errors an outlier of a sensor of the state is off
 
@@ -69,6 +68,7 @@ class SimSensor:
     sensing: SimulatedSensing
     laser: Laser | None = None
     raw: Callable[..., Raw] | None = None
+    frames: Array = field(default_factory=lambda: np.zeros((0, 3)))  # its true poses (steps + 1, 3 or 7)
     walked: int = 0  # the step up to which its constants have walked
     last: tuple[int, Array] | None = None  # step and robot's pose of the last reading or scan
     kept: dict[int, Array] = field(default_factory=dict)  # of an odometer that closes loops: poses by steps,
@@ -82,21 +82,22 @@ class SimSensor:
 
 @dataclass
 class SimRobot:
-    """A robot under way: its model, its true state, what steers it, and what it carries."""
+    """A robot: its model, and what it carries.
+
+    `states` (steps + 1, n) are the true ones, `poses` (steps + 1, 3 or 7) a view of them, `told` (steps, m) the
+    controls that its estimator is given, `done` those that moved it; by `constants` (c,) all controls are wrong.
+    """
 
     name: str
     motion: Any
-    state: Array
-    driver: Driver
     sensors: dict[str, SimSensor]
-    states: list[Array] = field(default_factory=list)
-    constants: Array = field(default_factory=lambda: np.zeros(0))
-    u: Array = field(default_factory=lambda: np.zeros(0))  # the control of the last step, as it was done
-
-    @property
-    def pose(self) -> Array:
-        """The true pose (3,) or (7,)."""
-        return self.state[: 3 if self.motion.space.world == "plane" else 7]
+    states: Array
+    poses: Array
+    told: Array
+    done: Array
+    course: Course
+    target: Array
+    constants: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,37 +139,38 @@ def simulate(world: World, seed: int | SeedSequence | Generator = 0) -> Log:
 
 def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simulation:
     """Return one simulated run: its log and its truth."""
-    chance = Chance(seed)
-    scenery = world.world.scenery(chance.layout)
-    things = things_in(world, scenery, chance.layout)
-    area = area_of(scenery, things)
-    robots = [sim_robot(world, name, area, chance, scenery) for name in world.robots]
-    times = [round(k * world.dt_s * 1e9) for k in range(world.steps + 1)]
+    chance, times = Chance(seed), [0, *world.times()]
+    robots, things = drive_all(world, [build_robot(world.models(), name) for name in world.robots], chance)
     events: list[Event] = []
     origins: dict[Key, tuple[Id | None, ...]] = {}
     for robot in robots:
         if coasts(robot.motion) and robot.sensors:  # it moves from the first event on: the start
-            events.append(first_event(robot, next(iter(robot.sensors)), chance))
-    for k, (before, now) in enumerate(pairwise(times), 1):
+            name = next(iter(robot.sensors))
+            scan = Scan(t_ns=0, robot=robot.name, sensor=name)
+            events.append(scan if robot.sensors[name].raw is None else raw_of(robot, name, 0, 0, chance))
+    for robot in robots:
+        at = times[:-1] if robot.motion.held else times[1:]
+        events += [Control(t_ns=t_ns, robot=robot.name, u=u) for t_ns, u in zip(at, robot.told, strict=True)]
+    for steps in spans(world, robots, things):
         for robot in robots:
-            u = step_robot(robot, world, chance.control)
-            events.append(Control(t_ns=before if robot.motion.held else now, robot=robot.name, u=u))
-        for robot in robots:
-            for scan, real in sensor_scans(robot, robots, things, world, k, now, chance):
-                events.append(scan)
-                origins[now, scan.robot, scan.sensor] = real
-            events += raw_data(robot, k, now, chance)
-    states = {r.name: np.array([*r.states, r.state]) for r in robots}
+            for k, name, y, ids, real in sensor_scans(robot, robots, things, world, steps, chance):
+                events.append(Scan(t_ns=times[k], robot=robot.name, sensor=name, y=y, ids=ids))
+                origins[times[k], robot.name, name] = real
+            for name, carried in robot.sensors.items():
+                if carried.raw is not None:
+                    at_k = steps[carried.sensing.scans_at(steps)].tolist()
+                    events += [raw_of(robot, name, k, times[k], chance) for k in at_k]
     log = Log(
         world.name, tuple(world.robots), sorted(events, key=sort_key), "simulated",
-        truth={r.name: Trajectory(np.array(times), states[r.name][:, : len(r.pose)]) for r in robots},
+        truth={r.name: Trajectory(np.array(times), r.poses) for r in robots},
         landmarks=true_landmarks(things),
         control_columns={r.name: r.motion.columns for r in robots},
         sensor_columns={(r.name, name): s.columns for r in robots for name, s in r.sensors.items()},
     )  # fmt: skip
     mounts = {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}
-    carried = {(r.name, name): s.sensor for r in robots for name, s in r.sensors.items()}
-    return Simulation(log, states, mounts, origins, {r.name: r.constants for r in robots}, carried)
+    carried_ = {(r.name, name): s.sensor for r in robots for name, s in r.sensors.items()}
+    constants = {r.name: r.constants for r in robots}
+    return Simulation(log, {r.name: r.states for r in robots}, mounts, origins, constants, carried_)
 
 
 def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
@@ -186,14 +188,6 @@ def things_in(world: World, scenery: Scenery, rng: Generator) -> dict[str, Thing
     return things
 
 
-def area_of(scenery: Scenery, things: dict[str, Things]) -> Array:
-    """Return the lower and the upper corner of all there is (2, D)."""
-    places = [sort.centres() for sort in things.values() if len(sort.values)]
-    places += [scenery.corners] if len(scenery.corners) else []
-    centres = np.concatenate(places or [np.zeros((1, things[POINTS].values.shape[1]))])
-    return np.array([centres.min(axis=0), centres.max(axis=0)])
-
-
 def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
     """Return by id the points (2|3,), segments (4|6,) from end to end and tags (7,)."""
     points = things[POINTS]
@@ -201,14 +195,14 @@ def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
     return {i: row.copy() for s, t in things.items() for i, row in enumerate(rows[s], t.first)}
 
 
-def sim_robot(world: World, name: str, area: Array, chance: Chance, scenery: Scenery) -> SimRobot:
+def sim_robot(world: World, robot: Robot, area: Array, chance: Chance, scenery: Scenery) -> SimRobot:
     """Put a robot at its start and its sensors on their mounts, drawn around configured values with sigmas.
 
     `area` (2, D) has the lower and the upper corner of the world, `scenery` may have raw data for them.
     """
-    simulated = world.robots[name]
-    robot = build_robot(world.models(), name)
-    state = draw_start(robot, chance.route)
+    simulated, motion = world.robots[robot.name], robot.motion
+    states = np.empty((world.steps + 1, motion.space.size))
+    states[0] = draw_start(robot, chance.route)
     sensors = {}
     for key, mount in robot.sensors.items():
         sensing = simulated.sensing.get(key, SimulatedSensing()).of(simulated.sensors[key], world.dt_s)
@@ -216,10 +210,12 @@ def sim_robot(world: World, name: str, area: Array, chance: Chance, scenery: Sce
         true, at = draw_mount(mount, chance.mounts)
         raw = scenery.raw_of(true, sensing) if scenery.raw_of is not None and sensing.images else None
         sensors[key] = SimSensor(true, at, sensing, laser, raw)
-    driver = simulated.route.driver(robot.motion, world.dt_s, area, chance.route)
-    model = self_calibrating(robot.motion)
+    course = simulated.route.course(world.steps, world.dt_s, area, chance.route)
+    model = self_calibrating(motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
-    return SimRobot(name, robot.motion, state, driver, sensors, constants=constants)
+    told, done = np.empty((2, world.steps, len(motion.columns)))
+    poses = states[:, : 3 if world.dimensions == 2 else 7]
+    return SimRobot(robot.name, motion, sensors, states, poses, told, done, course, next(course[1]), constants)
 
 
 def draw_start(robot: Robot, rng: Generator) -> Array:
@@ -244,18 +240,6 @@ def draw_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
     return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0), at
 
 
-def step_robot(robot: SimRobot, world: World, rng: Generator) -> Array:
-    """Move a robot by one step and return the control (m,) that its estimator is given."""
-    motion, dt_s, u = robot.motion, world.dt_s, robot.driver(robot.state)
-    error = gaussian(motion.control_noise(u), rng)
-    noisy, done = (u + error, u) if world.noise_on == "control" else (u, u + error)
-    robot.states.append(robot.state)
-    robot.u = done
-    D = diffusion_of(motion, robot.state, done, dt_s)
-    robot.state = disturb_state(motion, motion.move(robot.state, done, dt_s)[0], D, rng)
-    return given_control(motion, noisy, robot.constants, dt_s)
-
-
 def given_control(motion: Any, u: Array, constants: Array, dt_s: float) -> Array:
     """Return the control (m,) that is u (m,) in truth, with the constants (c,) by which all of a robot's are wrong."""
     out = u
@@ -266,101 +250,143 @@ def given_control(motion: Any, u: Array, constants: Array, dt_s: float) -> Array
 
 def add_diffusion(motion: Any, state: Array, u: Array, dt_s: float, rng: Generator) -> Array:
     """Return a state (size,) disturbed by the diffusion of the motion, if any, in `dt_s` of the control u (m,)."""
-    return disturb_state(motion, state, motion.diffusion(u, dt_s), rng)
+    D = motion.diffusion(u, dt_s)
+    return state if D is None else disturb_state(motion, state, gaussian(D, rng))
 
 
-def disturb_state(motion: Any, state: Array, D: Array | None, rng: Generator) -> Array:
-    """Return a state (size,) disturbed by a diffusion D (k, k) in the robot's frame."""
-    if D is None:
-        return state
-    d = np.zeros(motion.space.dof)
-    d[: len(D)] = body_axes(state, len(D)) @ gaussian(D, rng)
-    return motion.space.plus(state, d)
+def sensor_poses(poses: Array, at: Array) -> Array:
+    """Return the poses (K, 3 or 7) of a sensor that sits at (3,) or (7,) of a robot's poses."""
+    if len(at) == 7:
+        return np.array([sensor_pose(r, at)[0] for r in poses])
+    heading = poses[:, 2]
+    place = poses[:, 0] + 1j * poses[:, 1] + (at[0] + 1j * at[1]) * np.exp(1j * heading)
+    return np.column_stack([place.real, place.imag, heading + at[2]])
 
 
-def body_axes(state: Array, size: int) -> Array:
-    """Return the matrix (size, size) from errors in the robot's frame to the world's; rates stay in the body's."""
-    G = np.eye(size)
-    if len(state) < 7:  # a velocity behind a pose of the plane is in the robot's frame anyway
-        G[:2, :2] = rotation(state[2])
-        return G
-    Q = matrix(state[3:7].copy())
-    for at in range(0, min(size, 9), 3):
-        G[at : at + 3, at : at + 3] = Q
-    return G
+def drive_all(
+    world: World, robots: Sequence[Robot], chance: Chance, ways: Ways | None = None
+) -> tuple[list[SimRobot], dict[str, Things]]:
+    """Drive robots through all steps, compiled in `ways`, or in Python; return also what there is to see."""
+    scenery, dt_s = world.world.scenery(chance.layout), world.dt_s
+    things = things_in(world, scenery, chance.layout)
+    places = [sort.centres() for sort in things.values() if len(sort.values)]
+    places += [scenery.corners] if len(scenery.corners) else []
+    centres = np.concatenate(places or [np.zeros((1, things[POINTS].dimensions))])
+    area = np.array([centres.min(axis=0), centres.max(axis=0)])
+    driven = [sim_robot(world, robot, area, chance, scenery) for robot in robots]
+    z = chance.control.standard_normal(sum(r.told.size + world.steps * r.motion.space.dof for r in driven))
+    all_ways = [ways or python_ways(robot.motion, dt_s) for robot in robots]
+    leg, at = drive_leg if ways else python_form(drive_leg), 0
+    stride = world.steps if len(driven) == 1 else 1  # robots share their chance
+    for first in range(0, world.steps, stride):
+        for r, by in zip(driven, all_ways, strict=True):
+            (controls, ahead, limits), k, last = r.course, first, first + stride
+            while k < last:
+                r.target = aim(r.target, ahead, 2 * limits[1], r.states[k])
+                course, rules = (controls, r.target, limits), (dt_s, world.noise_on == "robot")
+                k, at = leg(by, course, (z, at), (k, last), rules, (r.states, r.told, r.done))
+    for r in driven:
+        for carried in r.sensors.values():
+            carried.frames = sensor_poses(r.poses, carried.at)
+        if len(r.constants):
+            r.told = np.array([given_control(r.motion, u, r.constants, dt_s) for u in r.told])
+    return driven, things
+
+
+def spans(world: World, robots: list[SimRobot], things: dict[str, Things]) -> list[Index]:
+    """Return the steps of which the scans are made at once.
+
+    One by one where sensors share chance, false measurements draw more, or what is seen depends on earlier scans.
+    """
+    steps, size = np.arange(1, world.steps + 1), 1
+    carried = [sensor for robot in robots for sensor in robot.sensors.values()]
+    alone = carried if len(robots) == len(carried) == 1 and world.dimensions == 2 else []
+    for s in alone:
+        steady = not (s.laser or s.sensing.outliers or isinstance(s.sensor, OfState | SeesVelocity))
+        if steady and sights.looks_for(s.sensor) == POINTS:
+            size = max(1, AT_ONCE // max(1, len(things[POINTS].values)))
+    return [steps[k : k + size] for k in range(0, len(steps), size)]
 
 
 def sensor_scans(
-    robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World, k: int, t_ns: int, chance: Chance
-) -> list[tuple[Scan, tuple[Id | None, ...]]]:
-    """Return the scans of a robot's sensors from its true pose at step k, and what each observation is really of."""
-    found: list[tuple[Scan, tuple[Id | None, ...]]] = []
+    robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World, steps: Index, chance: Chance
+) -> Iterator[Found]:
+    """Yield the scans of a robot's sensors at some steps; empty ones are left out."""
+    names: dict[int, Id | None] = {-1 - i: r.name for i, r in enumerate(robots)} | {0: None}
     for name, carried in robot.sensors.items():
-        if carried.raw is not None or not carried.sensing.scans_at(k):
+        at = steps[carried.sensing.scans_at(steps)]
+        if carried.raw is not None or not len(at) or isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
             continue
-        if isinstance(carried.sensor, ZeroVelocity2D | ZeroVelocity3D):
-            continue
+        k = int(at[0])
         if carried.laser is not None:
-            y = laser.beams(
-                carried.laser, carried.sensing, sensor_pose(robot.pose, carried.at)[0], things, chance.sight
-            )
+            y = laser.beams(carried.laser, carried.sensing, carried.frames[k], things, chance.sight)
             if len(y):
-                scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y)
-                found.append((scan, (None,) * len(y)))
-            continue
-        if isinstance(carried.sensor, OfState):
+                yield k, name, y, None, (None,) * len(y)
+        elif isinstance(carried.sensor, OfState):
             read, ids = reading(robot, carried, k, world.dt_s, chance), None
             if carried.sensing.loop_reach_m is not None:
                 read, ids = with_loop(robot, carried, k, world.dt_s, read, chance)
             if read is not None:
-                scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=read, ids=ids)
-                found.append((scan, (robot.name,) * len(read)))
-            continue
-        sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
-        others = {r.name: r.pose for r in robots if r is not robot} if world.sight_robots else {}
-        t = np.zeros(0)
-        if isinstance(sensor, SeesVelocity):  # of what stands still
-            t, others = sensor_velocity(robot, carried, k, world.dt_s), {}
-        sighted = observe_things(sensor, sensor_pose(robot.pose, carried.at)[0], there, others, world, chance.sight, t)
-        sighted, real = sights.report_with_faults(sensor, sighted, carried.sensing, k, there, chance.faults)
-        y = sights.noisy_measurements(sensor, sighted.e, chance.sight)
-        kept = sights.is_reportable(sensor, y)
-        if len(kept):
-            ids = [sighted.ids[i] for i in kept] if world.ids else None
-            scan = Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y[kept], ids=ids)
-            carried.last = k, robot.pose.copy()
-            found.append((scan, tuple(real[i] for i in kept)))
-    return found
+                yield k, name, read, ids, (robot.name,) * len(read)
+        else:
+            for seen in sight(carried, robot, robots, things, world, at, chance):
+                told, real = ([names.get(i, i) for i in part.tolist()] for part in (seen.ids, seen.real))
+                for k in np.unique(seen.steps).tolist():
+                    rows = slice(*np.searchsorted(seen.steps, (k, k + 1)))
+                    carried.last = k, robot.poses[k].copy()
+                    yield k, name, seen.e[rows], told[rows] if world.ids else None, tuple(real[rows])
 
 
-def raw_data(robot: SimRobot, k: int, t_ns: int, chance: Chance) -> list[Raw]:
-    """Return the raw data of a robot's sensors that give them, from its true pose at step k."""
-    return [
-        raw_of(robot, name, carried.raw, t_ns, chance)
-        for name, carried in robot.sensors.items()
-        if carried.raw is not None and carried.sensing.scans_at(k)
-    ]
+def sight(
+    carried: SimSensor, robot: SimRobot, robots: list[SimRobot], things: dict[str, Things], world: World,
+    steps: Index, chance: Chance,
+) -> Iterator[Sighted]:  # fmt: skip
+    """Yield what a sensor of landmarks reports at some steps, with noise and faults, all of a step at once."""
+    sensor, there = carried.sensor, things[sights.looks_for(carried.sensor)]
+    seen = visible(carried, robot, robots, there, world, steps)
+    parts: tuple[Any, ...] = seen
+    landmarks = np.count_nonzero(seen.real > 0)
+    groups: Iterable[Index] = sights.reported_rows(
+        there, Sighted(*(part[:landmarks] for part in parts)), world.new_per_step, world.max_per_scan, chance.sight
+    )
+    if landmarks < len(seen.real):
+        groups = [np.concatenate([*groups, np.arange(landmarks, len(seen.real))])]
+    for rows in groups:
+        part = sights.report_with_faults(sensor, seen.rows(rows), carried.sensing, there, chance.faults)
+        part = part._replace(e=sights.noisy_measurements(sensor, part.e, chance.sight))
+        yield part.rows(sights.is_reportable(sensor, part.e))
 
 
-def raw_of(robot: SimRobot, name: str, make: Callable[..., Raw], t_ns: int, chance: Chance) -> Raw:
-    """Return the raw data of a sensor, as its scene makes them, from its robot's true pose."""
-    T, seed = sensor_pose(robot.pose, robot.sensors[name].at)[0], int(chance.sight.integers(2**62))
-    return make(T, t_ns, robot.name, name, seed)
+def visible(
+    carried: SimSensor, robot: SimRobot, robots: list[SimRobot], there: Things, world: World, steps: Index
+) -> Sighted:
+    """Return what a sensor can observe at some steps, or at one: there other robots, too, which are last."""
+    sensor, T, d, others = carried.sensor, carried.frames[steps], world.dimensions, np.zeros(0, dtype=np.int64)
+    if len(steps) != 1:
+        of, near, v = sights.points_in_reach(T, there.values, range_limit(sensor))
+    else:
+        near, k, moving = there.near(T[0, :d], range_limit(sensor)), int(steps[0]), isinstance(sensor, SeesVelocity)
+        if world.sight_robots and there.sort == POINTS and not moving:
+            others = np.array([i for i, r in enumerate(robots) if r is not robot], dtype=np.int64)
+        places = [robots[i].poses[k, :d] for i in others]
+        v = things_in_frame(there.sort, T[0], np.vstack([there.values[near], *places]))
+        of = np.zeros(len(v), dtype=np.int64)
+        if moving:  # it sees what stands still
+            k_before, before = carried.last or (0, robot.poses[0])
+            state = robot.states[k] if tells_velocity(robot.motion) else np.array(before)
+            since = np.array([(k - k_before) * world.dt_s, *robot.done[k - 1]])
+            t = velocity_of(robot.motion, carried.at, robot.poses[k], state, since)[0]
+            v = np.column_stack([v, np.tile(t, (len(v), 1))])
+    sizes, ids = np.append(there.sizes[near], 0.0 * others), np.append(near + there.first, -1 - others)
+    inside, e = sights.exact_measurements(sensor, v, sizes)
+    return Sighted(steps[of], ids, ids, v, e, sizes).rows(np.flatnonzero(inside))
 
 
-def first_event(robot: SimRobot, name: str, chance: Chance) -> Event:
-    """Return the first event of a robot that moves without controls: an empty scan of a sensor, or raw data."""
-    make = robot.sensors[name].raw
-    if make is None:
-        return Scan(t_ns=0, robot=robot.name, sensor=name)
-    return raw_of(robot, name, make, 0, chance)
-
-
-def sensor_velocity(robot: SimRobot, carried: SimSensor, k: int, dt_s: float) -> Array:
-    """Return the velocity (2 or 3,) of a sensor at step k in its frame, or the mean since its last scan."""
-    k_before, before = carried.last or (0, robot.states[0][: len(robot.pose)])
-    state = robot.state if tells_velocity(robot.motion) else np.array(before)
-    return velocity_of(robot.motion, carried.at, robot.pose, state, np.array([(k - k_before) * dt_s, *robot.u]))[0]
+def raw_of(robot: SimRobot, name: str, k: int, t_ns: int, chance: Chance) -> Raw:
+    """Return the raw data of a sensor, as its scene makes them, from its robot's true pose at step k."""
+    carried, seed = robot.sensors[name], int(chance.sight.integers(2**62))
+    assert carried.raw is not None
+    return carried.raw(carried.frames[k], t_ns, robot.name, name, seed)
 
 
 def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Chance) -> Array | None:
@@ -370,12 +396,12 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
     """
     of, at = carried.sensor, carried.at
     last, walked_s = carried.last, (k - carried.walked) * dt_s
-    before, k_before = (robot.states[0][: len(robot.pose)], 0) if last is None else last[::-1]
-    since_s, carried.last, carried.walked = (k - k_before) * dt_s, (k, robot.pose.copy()), k
+    before, k_before = (robot.poses[0], 0) if last is None else last[::-1]
+    since_s, carried.last, carried.walked = (k - k_before) * dt_s, (k, robot.poses[k].copy()), k
     if isinstance(of, Drifting) and (Q := of.drift(walked_s)).any():
         of = carried.sensor = of.with_parameters(of.parameters + chance.sight.normal(0.0, np.sqrt(Q)))  # type: ignore[attr-defined]
     counts = of.views != POSE and not sees_state(of, robot.motion)
-    v = view_of_state(of, robot.motion, at, robot.state, np.array(before), np.array([since_s, *robot.u]))
+    v = view_of_state(of, robot.motion, at, robot.states[k], np.array(before), np.array([since_s, *robot.done[k - 1]]))
     y, wild = measure_state(carried, v, since_s if counts else 0.0, chance)
     if wild < (carried.sensing.dropouts or 0.0):
         carried.last = last if counts else carried.last
@@ -401,44 +427,21 @@ def with_loop(
 
     That is the nearest of those that are kept, of which the robot has been farther since.  An id is its time.
     """
-    of, reach_m, d = carried.sensor, carried.sensing.loop_reach_m or 0.0, len(robot.pose) // 3 + 1
+    of, reach_m, here = carried.sensor, carried.sensing.loop_reach_m or 0.0, robot.poses[k]
+    d = len(here) // 3 + 1
     rows, ids = ([], []) if read is None else ([*read], list[Id | None]([None]))
-    far = {j: float(np.linalg.norm(robot.pose[:d] - pose[:d])) for j, pose in carried.kept.items()}
+    far = {j: float(np.linalg.norm(here[:d] - pose[:d])) for j, pose in carried.kept.items()}
     carried.left |= {j for j, far_m in far.items() if far_m > reach_m}
     near = [j for j in far if j in carried.left and far[j] <= reach_m]
     if near:
         j = min(near, key=far.__getitem__)
         since = np.array([(k - j) * dt_s])
-        v = view_of_state(of, robot.motion, carried.at, robot.state, carried.kept[j], since)
+        v = view_of_state(of, robot.motion, carried.at, robot.states[k], carried.kept[j], since)
         rows, ids = (
             [*rows, *measure_state(carried, v, 0.0, chance)[0]],
             [*ids, landmark_id(seconds_text(round(j * dt_s * 1e9)))],
         )
-    carried.kept[k], carried.last = robot.pose.copy(), (k, robot.pose.copy())
+    carried.kept[k], carried.last = here.copy(), (k, here.copy())
     for j in [*carried.kept][: -poses_kept(of)]:
         del carried.kept[j]
     return np.array(rows).reshape(len(rows), len(of.columns)), ids
-
-
-def observe_things(
-    sensor: Any, T: Array, things: Things, others: dict[str, Array], world: World, rng: Generator, velocity: Array
-) -> Sighted:  # fmt: skip
-    """Return the observations y (K, m) of a sensor at T (3,) or (7,), those of other robots last.
-
-    `velocity` is that of a sensor that measures it, in its frame, of others empty.
-    """
-    near = things.near(T[: world.dimensions], range_limit(sensor))
-    v = things_in_frame(things.sort, T, things.values[near])
-    v = np.column_stack([v, np.tile(velocity, (len(v), 1))])
-    inside, e = sights.exact_measurements(sensor, v, things.sizes[near])
-    near, v, e = near[inside], v[inside], e[inside]
-    distance = np.linalg.norm(sights.centre(things.sort, v, world.dimensions), axis=1)
-    rows = sights.select_reported(things, near, distance, world.new_per_step, world.max_per_scan, rng)
-    ids: list[Id] = [int(i) + things.first for i in near[rows]]
-    v, e, sizes = v[rows], e[rows], things.sizes[near[rows]]
-    if others and things.sort == POINTS:
-        w = things_in_frame(POINTS, T, np.array([pose[: world.dimensions] for pose in others.values()]))
-        inside, f = sights.exact_measurements(sensor, w, np.zeros(len(w)))
-        v, e, sizes = np.concatenate([v, w[inside]]), np.concatenate([e, f[inside]]), np.append(sizes, 0 * f[inside, 0])
-        ids += [name for name, seen in zip(others, inside, strict=True) if seen]
-    return Sighted(v, e, sizes, ids)

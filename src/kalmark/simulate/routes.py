@@ -1,9 +1,12 @@
-"""Routes of a simulated robot: a constant control, waypoints, a random walk between places, lanes."""
+"""Routes of a simulated robot: a constant control, waypoints, a random walk between places, lanes; and the way along.
+
+`drive_leg` has one source: compiled for some `MOTIONS`, as plain Python for all of them.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import cycle
 from typing import Annotated, Any, Literal
 
@@ -12,8 +15,10 @@ from numpy.random import Generator
 from pydantic import Field
 
 from kalmark.arrays import Array
+from kalmark.compiled import address_of, by_address, compiled, python_form, signature_of
 from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section
-from kalmark.geometry.angles import wrap
+from kalmark.geometry.angles import rotation, wrap
+from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import left_jacobian, matrix
 from kalmark.models.motion import (
     Ackermann,
@@ -28,13 +33,27 @@ from kalmark.models.motion import (
     Tricycle,
     Unicycle,
 )
-from kalmark.models.protocols import HasVelocity
+from kalmark.models.observe import MOVE, NOTHING, call_move
+from kalmark.models.protocols import HasVelocity, diffusion_of
 from kalmark.simulate.layouts import Points
+from kalmark.simulate.sights import correlated
 
 SLOW_S = 1.0  # in which a robot steered by impulses turns to its target
 REACHED_S = 0.2  # in which a robot of space turns to its target, and one that accelerates has its speed
 
-Driver = Callable[[Array], Array]  # true state -> control of the next step
+STEER = signature_of("f8[::1](i8, f8[::1], f8[::1], f8[::1], UniTuple(f8, 2), f8)")
+WALK = signature_of("Tuple((f8[::1], i8))(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
+ERROR = signature_of("f8[::1](f8[::1], f8[::1])")
+call_steer, call_walk, call_error = by_address(STEER), by_address(WALK), by_address(ERROR)
+
+# what moves and steers a robot, the error of a control and the random walk, by address or as Python, then the number of
+# the motion among `MOTIONS`; its parameters, the sigmas of a control (none: by the function) and those of the walk
+Ways = tuple[tuple[Any, Any, Any, Any, int], tuple[Array, Array, Array]]
+MOTIONS = (Unicycle, Odometry2D, Ackermann)  # driven in compiled code
+
+
+# controls (steps, m), or none and places (D,) to drive to, and the speed in m/s and the tightest turn in m
+Course = tuple[Array, Iterator[Array], tuple[float, float]]
 
 
 class Constant(Section):
@@ -50,16 +69,15 @@ class Constant(Section):
     ramp_s: NotNegative = 0.0
     """Time in which the control rises after a stop and falls before the next, at most half of `drive_s` each."""
 
-    def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
-        """Return the function from a true state (size,) to the control (m,)."""
-        u, stop = np.array(self.u), np.zeros(len(self.u))
-        if not self.stop_s:
-            return lambda state: u
-        steps, stops = (max(1, round(time / dt_s)) for time in (self.drive_s, self.stop_s))
-        ramp = max(0.5, min(self.ramp_s, self.drive_s / 2) / dt_s)
-        shares = np.clip((np.arange(steps) + 0.5) / ramp, 0.0, 1.0)
-        controls = cycle([*(np.minimum(shares, shares[::-1])[:, None] * u), *[stop] * stops])
-        return lambda state: next(controls)
+    def course(self, steps: int, dt_s: float, area: Array, rng: Generator) -> Course:
+        """Return the course of so many steps."""
+        u = np.array([self.u])
+        if self.stop_s:
+            driven, stops = (max(1, round(time / dt_s)) for time in (self.drive_s, self.stop_s))
+            ramp = max(0.5, min(self.ramp_s, self.drive_s / 2) / dt_s)
+            shares = np.clip((np.arange(driven) + 0.5) / ramp, 0.0, 1.0)
+            u = np.append(np.minimum(shares, shares[::-1]), np.zeros(stops))[:, None] * u
+        return np.resize(u, (steps, len(self.u))), cycle([NOTHING]), (0.0, 0.0)
 
 
 class Drive(Section):
@@ -74,24 +92,9 @@ class Drive(Section):
         """Yield the places (D,) to drive to, without end, within `area` (2, D)."""
         raise NotImplementedError
 
-    def driver(self, motion: Any, dt_s: float, area: Array, rng: Generator) -> Driver:
-        """Return the function from a true state (size,) to the control (m,) towards the next place."""
-        places = self.places(area, rng)
-        target = next(places)
-        steer = steer_in_space if motion.space.world == "space" else steer_in_plane
-
-        def drive(state: Array) -> Array:
-            nonlocal target
-            for _ in range(1000):
-                n = min(len(target), 3 if motion.space.world == "space" else 2)
-                if math.dist(target[:n], state[:n]) > 2 * self.turn_radius_m:
-                    break
-                reached, target = target, next(places)
-                if np.array_equal(target, reached):  # there is no other: in an area of one landmark
-                    break
-            return steer(motion, state, target, self, dt_s)
-
-        return drive
+    def course(self, steps: int, dt_s: float, area: Array, rng: Generator) -> Course:
+        """Return the course from place to place."""
+        return np.zeros((0, 0)), self.places(area, rng), (self.speed_mps, self.turn_radius_m)
 
 
 class Waypoints(Drive):
@@ -135,21 +138,46 @@ class Lanes(Drive):
 Route = Annotated[Any, OneOf(Constant, Waypoints, Wander, Lanes)]
 
 
-def steer_in_plane(motion: Any, state: Array, target: Array, drive: Drive, dt_s: float) -> Array:
-    """Return the control that turns the robot towards a target (2,) as fast as it may."""
-    error = wrap(math.atan2(target[1] - state[1], target[0] - state[0]) - state[2])
-    limit, columns = drive.speed_mps / drive.turn_radius_m, motion.columns
-    if isinstance(motion, HasVelocity):  # by impulses
-        w = min(limit, max(-limit, error / max(dt_s, SLOW_S)))
-        change = np.array([drive.speed_mps, 0.0, w]) - motion.body_velocity(state)[0]
-        return change if len(columns) == 3 else change[[0, 2]]
-    return control_of_velocity(motion, drive.speed_mps, min(limit, max(-limit, error / dt_s)), dt_s)
+def aim(target: Array, ahead: Iterator[Array], reach_m: float, state: Array) -> Array:
+    """Return the target (D,), or the next one ahead that is out of reach of a state (size,)."""
+    for _ in range(1000):
+        if math.dist(target, state[: len(target)]) > reach_m:
+            break
+        reached, target = target, next(ahead)
+        if np.array_equal(target, reached):  # there is no other: in an area of one landmark
+            break
+    return target
+
+
+@compiled
+def turn_rate(r: Array, target: Array, limits: tuple[float, float], dt_s: float) -> float:
+    """Return the rate (rad/s) that turns a robot at r (3,) towards a target (2,) in `dt_s`, or as fast as it may."""
+    limit = limits[0] / limits[1]
+    error = wrap(math.atan2(target[1] - r[1], target[0] - r[0]) - r[2])
+    return min(limit, max(-limit, error / dt_s))
+
+
+@compiled
+def control_in_plane(number: int, par: Array, v: float, w: float, dt_s: float) -> Array:
+    """Return the control (m,) of a motion among `MOTIONS`, with parameters `par`; see `control_of_velocity`."""
+    if number == 0:
+        return np.array([v, w])
+    if number == 1:
+        a = 0.5 * w * dt_s
+        chord = v * dt_s * (math.sin(a) / a if a != 0.0 else 1.0)
+        return np.array([chord * math.cos(a), chord * math.sin(a), 2 * a])
+    tan = w * par[0] / v
+    return np.array([v * (1.0 - tan * par[1] / par[0]), math.atan(tan)])
+
+
+@compiled
+def steer_in_plane(number: int, par: Array, r: Array, target: Array, limits: tuple[float, float], dt_s: float) -> Array:
+    """Return the control (m,) that turns a robot at r (3,) towards a target (2,) as fast as it may."""
+    return control_in_plane(number, par, limits[0], turn_rate(r, target, limits, dt_s), dt_s)
 
 
 def control_of_velocity(motion: Any, v: float, w: float, dt_s: float) -> Array:
     """Return the control (m,) of `motion` that drives at v (m/s) and turns at w (rad/s) for `dt_s`."""
-    if isinstance(motion, Unicycle | SlippingUnicycle):
-        return np.array([v, w])
     if isinstance(motion, Omnidirectional):
         return np.array([v, 0.0, w])
     if isinstance(motion, Mecanum):
@@ -159,16 +187,23 @@ def control_of_velocity(motion: Any, v: float, w: float, dt_s: float) -> Array:
     if isinstance(motion, DifferentialDrive):
         half = 0.5 * w * motion.track_m
         return np.array([(v - half) * dt_s / motion.left_radius_m, (v + half) * dt_s / motion.right_radius_m])
-    if isinstance(motion, Odometry2D):
-        a = 0.5 * w * dt_s
-        chord = v * dt_s * (math.sin(a) / a if a else 1.0)
-        return np.array([chord * math.cos(a), chord * math.sin(a), 2 * a])
-    assert isinstance(motion, Ackermann)
-    tan = w * motion.wheelbase_m / v
-    return np.array([v * (1.0 - tan * motion.encoder_offset_m / motion.wheelbase_m), math.atan(tan)])
+    number = 0 if isinstance(motion, SlippingUnicycle) else [isinstance(motion, of) for of in MOTIONS].index(True)
+    return python_form(control_in_plane)(number, motion.parameters, v, w, dt_s)
 
 
-def steer_in_space(motion: Any, state: Array, target: Array, drive: Drive, dt_s: float) -> Array:
+def steer(motion: Any, r: Array, target: Array, limits: tuple[float, float], dt_s: float) -> Array:
+    """Return the control (m,) that turns a robot at r (size,) towards a target (2,) or (3,) as fast as it may."""
+    if motion.space.world == "space":
+        return steer_in_space(motion, r, target, limits, dt_s)
+    columns = motion.columns
+    if not isinstance(motion, HasVelocity):
+        return control_of_velocity(motion, limits[0], python_form(turn_rate)(r, target, limits, dt_s), dt_s)
+    w = python_form(turn_rate)(r, target, limits, max(dt_s, SLOW_S))
+    change = np.array([limits[0], 0.0, w]) - motion.body_velocity(r)[0]  # by impulses
+    return change if len(columns) == 3 else change[[0, 2]]
+
+
+def steer_in_space(motion: Any, state: Array, target: Array, limits: tuple[float, float], dt_s: float) -> Array:
     """Return the control that turns the nose, the x axis, towards a target (2,) or (3,), and levels the wings."""
     Q = matrix(state[3:7].copy())
     ahead = Q.T @ (np.append(target[:2], target[2] if len(target) == 3 else state[2]) - state[:3])
@@ -176,9 +211,8 @@ def steer_in_space(motion: Any, state: Array, target: Array, drive: Drive, dt_s:
     pitch, yaw = math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1])), math.atan2(ahead[1], ahead[0])
     error = np.array([-math.atan2(up[1], up[2]), pitch, yaw])
     w = error / max(dt_s, REACHED_S)
-    limit = drive.speed_mps / drive.turn_radius_m
-    w *= min(1.0, limit / max(float(np.linalg.norm(w)), 1e-12))
-    return control_in_space(motion, state, np.array([drive.speed_mps, 0.0, 0.0]), w, dt_s)
+    w *= min(1.0, limits[0] / limits[1] / max(float(np.linalg.norm(w)), 1e-12))
+    return control_in_space(motion, state, np.array([limits[0], 0.0, 0.0]), w, dt_s)
 
 
 def control_in_space(motion: Any, state: Array, v: Array, w: Array, dt_s: float) -> Array:
@@ -193,3 +227,85 @@ def control_in_space(motion: Any, state: Array, v: Array, w: Array, dt_s: float)
     if len(state) == 7:
         return np.concatenate([v, w])
     return np.concatenate([matrix(state[3:7].copy()) @ v - state[7:10], w - state[10:13]])  # impulses
+
+
+@compiled
+def walk_in_plane(sigmas: Array, r: Array, u: Array, moved: Array, z: Array) -> tuple[Array, int]:
+    """Return a pose (3,) that u (m,) moved, and walked at random by sigmas (3 or 0,) in its frame; and how many z."""
+    if len(sigmas) == 0 or not u.any():
+        return moved, 0
+    return compose(moved, sigmas * z[:3])[0], 3
+
+
+def compiled_ways(motion: Any, dt_s: float) -> Ways:
+    """Return the addresses of one of `MOTIONS`, whose noise does not depend on the control."""
+    u = np.ones(len(motion.columns))
+    D = motion.diffusion(u, dt_s)
+    covs = motion.control_noise(u), np.zeros((0, 0)) if D is None else D
+    calls = address_of(type(motion).moves, MOVE), address_of(steer_in_plane, STEER), 0, address_of(walk_in_plane, WALK)
+    sigmas, walks = (np.sqrt(np.diagonal(cov)) for cov in covs)
+    return (*calls, MOTIONS.index(type(motion))), (motion.parameters, sigmas, walks)
+
+
+def python_ways(motion: Any, dt_s: float) -> Ways:
+    """Return the functions of any motion."""
+
+    def walk(par: Array, r: Array, u: Array, moved: Array, z: Array) -> tuple[Array, int]:
+        D = diffusion_of(motion, r, u, dt_s)
+        return (moved, 0) if D is None else (disturb_state(motion, moved, correlated(D, z[: len(D)])), len(D))
+
+    calls = (
+        lambda r, u, par, dt_s: motion.move(r, u, dt_s), lambda number, par, *where: steer(motion, *where),
+        lambda u, z: correlated(motion.control_noise(u), z), walk, -1,
+    )  # fmt: skip
+    return calls, (NOTHING, NOTHING, NOTHING)
+
+
+@compiled
+def drive_leg(
+    ways: Ways, course: tuple[Array, Array, tuple[float, float]], chance: tuple[Array, int], span: tuple[int, int],
+    rules: tuple[float, bool], out: tuple[Array, Array, Array],
+) -> tuple[int, int]:  # fmt: skip
+    """Drive through a span of steps, or until the target is reached; return the step, and how many z are used.
+
+    `course` are the controls (steps, m), the target and the limits, `chance` standard normal numbers z and how many of
+    them are used, `rules` the duration of a step and whether errors are the robot's.  Written are the states (steps +
+    1, size), of which the first is given, the controls that the estimator is given, and those that are done (steps, m).
+    """
+    (move, steering, error, walk, number), (par, sigmas, walks) = ways
+    (controls, target, limits), (z, at), (dt_s, on_robot), (states, told, done) = course, chance, rules, out
+    for k in range(span[0], span[1]):
+        r = states[k]
+        u = controls[k] if len(controls) else call_steer(steering, (number, par, r, target, limits, dt_s))
+        drawn = z[at : at + len(u)]
+        wrong = u + (sigmas * drawn if len(sigmas) else call_error(error, (u, drawn)))
+        told[k], done[k] = (u, wrong) if on_robot else (wrong, u)
+        at += len(u)
+        moved, used = call_walk(walk, (walks, r, done[k], call_move(move, (r, done[k], par, dt_s))[0], z[at:]))
+        at += used
+        states[k + 1] = moved
+        far = 0.0
+        for j in range(len(target)):
+            far += (target[j] - moved[j]) ** 2
+        if math.sqrt(far) < 2 * limits[1]:
+            return k + 1, at
+    return span[1], at
+
+
+def disturb_state(motion: Any, state: Array, d: Array) -> Array:
+    """Return a state (size,) disturbed by d (k,) in the robot's frame."""
+    step = np.zeros(motion.space.dof)
+    step[: len(d)] = body_axes(state, len(d)) @ d
+    return np.asarray(motion.space.plus(state, step))
+
+
+def body_axes(state: Array, size: int) -> Array:
+    """Return the matrix (size, size) from errors in the robot's frame to the world's; rates stay in the body's."""
+    G = np.eye(size)
+    if len(state) < 7:  # a velocity behind a pose of the plane is in the robot's frame anyway
+        G[:2, :2] = rotation(state[2])
+        return G
+    Q = matrix(state[3:7].copy())
+    for at in range(0, min(size, 9), 3):
+        G[at : at + 3, at : at + 3] = Q
+    return G

@@ -7,6 +7,7 @@ of the image, but its noise is that of the sensor everywhere.  ([TB] adds it bef
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, NamedTuple
@@ -18,7 +19,6 @@ from pydantic import Field
 from kalmark import presets
 from kalmark.arrays import Array, Flags, Index
 from kalmark.config.sections import NotNegative, Section
-from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE3
@@ -28,8 +28,6 @@ from kalmark.models.sensors import Wall
 from kalmark.models.tags import corners, tag_seen_from
 from kalmark.models.walls import orient_segments
 from kalmark.simulate.layouts import Scenery
-
-Indices = Index
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Pair = Annotated[tuple[int, int], Field(strict=False)]
@@ -48,12 +46,23 @@ def looks_for(sensor: Any) -> str:
 
 
 class Sighted(NamedTuple):
-    """Observable landmarks of a sensor: v (K, n) in its frame, measurements e (K, m), sizes of tags (K,), and ids."""
+    """Observations of a sensor, those of one step after those of another: at which `steps` (N,), in order.
 
+    `ids` (N,) are reported, `real` (N,) those of what is really seen: a landmark's, -1, -2, ... for a robot by its
+    number, 0 for nothing.  Then v (N, n) in the sensor's frame, measurements e (N, m), sizes of tags (N,).
+    """
+
+    steps: Index
+    ids: Index
+    real: Index
     v: Array
     e: Array
     sizes: Array
-    ids: list[Id]
+
+    def rows(self, rows: Index) -> Sighted:
+        """Return some of them."""
+        parts: tuple[Any, ...] = self
+        return Sighted(*(part.take(rows, axis=0) for part in parts))
 
 
 class SimulatedSensing(Section):
@@ -96,11 +105,11 @@ class SimulatedSensing(Section):
         usual = {"every": max(1, round(1 / (preset.rate_hz * dt_s))), "dropouts": preset.dropouts}
         return self.model_copy(update={key: value for key, value in usual.items() if getattr(self, key) is None})
 
-    def scans_at(self, k: int) -> bool:
-        """Return whether there is a scan at step k."""
+    def scans_at(self, k: Any) -> Any:
+        """Return whether there is a scan at step k, or at each of k (K,)."""
         every = self.every or 1
         first = every if self.first is None else self.first
-        return k >= first and (k - first) % every == 0
+        return (k >= first) & ((k - first) % every == 0)
 
     @property
     def has_faults(self) -> bool:
@@ -137,11 +146,23 @@ class Things:
         """Return where they are (M, 2|3), segments by their middles."""
         return centre(self.sort, self.values, self.dimensions)
 
-    def near(self, place: Array, reach_m: float) -> Indices:
+    def near(self, place: Array, reach_m: float) -> Index:
         """Return the indices (K,) of those within `reach_m` of a place (D,), in order."""
         if math.isinf(reach_m) or not len(self.values):
             return np.arange(len(self.values))
         return np.array(sorted(self.tree.query_ball_point(place, reach_m)), dtype=np.int64)
+
+
+def points_in_reach(T: Array, points: Array, reach_m: float) -> tuple[Index, Index, Array]:
+    """Return which points (M, n) are in reach of which of the frames T (K, 3) of the plane, and how they are there.
+
+    That is the numbers of frames (N,) and of points (N,), and v (N, n), what is behind x and y unchanged.
+    """
+    places, origins = (p[:, 0] + 1j * p[:, 1] for p in (points, T))
+    d = places - origins[:, None]
+    frames, numbers = np.nonzero(d.real**2 + d.imag**2 <= reach_m**2)
+    v = d[frames, numbers] * np.exp(-1j * T[:, 2])[frames]
+    return frames, numbers, np.column_stack([v.real, v.imag, points[numbers, 2:]])
 
 
 def things_of(scenery: Scenery, dimensions: int) -> dict[str, Things]:
@@ -215,53 +236,73 @@ def noisy_measurements(sensor: Any, e: Array, rng: Generator, cov: Array | None 
     return orient_segments(y) if isinstance(sensor, Wall) else y  # noise may take a line to the other side
 
 
-def is_reportable(sensor: Any, y: Array) -> Indices:
+def is_reportable(sensor: Any, y: Array) -> Index:
     """Return which noisy measurements y (K, m) a sensor can report: noise may take a range below zero."""
     return np.flatnonzero((y[:, 0] >= 0) | (sensor.columns[0] != "range_m"))
 
 
 def gaussian(cov: Array, rng: Generator) -> Array:
     """Draw from zero-mean Gaussians with positive semidefinite covariances (..., n, n)."""
+    return correlated(cov, rng.standard_normal(cov.shape[:-1]))
+
+
+def correlated(cov: Array, z: Array) -> Array:
+    """Return standard normal numbers z (..., n) with the covariances (..., n, n)."""
     variances = np.einsum("...ii->...i", cov)
     if np.count_nonzero(cov) == np.count_nonzero(variances):
-        return np.sqrt(variances) * rng.standard_normal(variances.shape)
+        return np.sqrt(variances) * z
     variances, axes = np.linalg.eigh(cov)
-    draw = np.sqrt(np.maximum(variances, 0.0)) * rng.standard_normal(variances.shape)
-    return np.einsum("...ij,...j->...i", axes, draw)
+    return np.einsum("...ij,...j->...i", axes, np.sqrt(np.maximum(variances, 0.0)) * z)
 
 
-def select_reported(
-    things: Things, near: Indices, distance: Array, new_per_step: int | None, max_per_scan: int | None, rng: Generator
-) -> Indices:
-    """Return which (R,) of the visible things, rows of `near` (K,), are reported, in order, and note them as seen."""
-    rows = np.arange(len(near))
-    if new_per_step is not None:
-        new = np.flatnonzero(~things.seen[near])
-        rows = np.union1d(np.flatnonzero(things.seen[near]), rng.permutation(new)[:new_per_step])
+def reported_rows(
+    things: Things, seen: Sighted, new_per_step: int | None, max_per_scan: int | None, rng: Generator
+) -> Iterator[Index]:
+    """Yield rows of what is seen that are reported, and note them as seen.
+
+    These are of many steps at once; alone are those that start new landmarks, for which they draw from the same source
+    of chance as the noise does.
+    """
+    distance = np.linalg.norm(centre(things.sort, seen.v, things.dimensions), axis=1)
+    steps, near, at = seen.steps, seen.real - things.first, 0
+    rows = np.arange(len(steps))
     if max_per_scan is not None:
-        rows = np.sort(rows[np.argsort(distance[rows], kind="stable")[:max_per_scan]])
-    things.seen[near[rows]] = True
-    return rows
+        rows = np.sort(np.lexsort((distance, steps))[rows - np.searchsorted(steps, steps) < max_per_scan])
+    if new_per_step is None:
+        yield rows
+        return
+    while at < len(steps):
+        unseen = np.flatnonzero(~things.seen[near[at:]])
+        k = steps[at + unseen[0]] if len(unseen) else steps[-1] + 1
+        here, then = np.searchsorted(steps, (k, k + 1)).tolist()
+        yield rows[slice(*np.searchsorted(rows, (at, here)))]
+        at = then
+        if then > here:
+            known = things.seen[near[here:then]]
+            new = rng.permutation(here + np.flatnonzero(~known))[:new_per_step]
+            told = np.union1d(here + np.flatnonzero(known), new)
+            told = np.sort(told[np.argsort(distance[told], kind="stable")[:max_per_scan]])
+            things.seen[near[told]] = True
+            yield told
 
 
 def report_with_faults(
-    sensor: Any, sighted: Sighted, sensing: SimulatedSensing, k: int, things: Things, rng: Generator
-) -> tuple[Sighted, list[Id | None]]:
-    """Return what is reported at step k of what is seen, before noise, and what each observation is really of."""
-    real: list[Id | None] = list(sighted.ids)
-    if k < sensing.faults_from_step or not sensing.has_faults:
-        return sighted, real
-    v, e, sizes, ids = sighted
+    sensor: Any, seen: Sighted, sensing: SimulatedSensing, things: Things, rng: Generator
+) -> Sighted:
+    """Return what is reported of what is seen, before noise."""
+    late = np.flatnonzero(seen.steps >= sensing.faults_from_step)
+    if not sensing.has_faults or not len(late):
+        return seen
     if sensing.outliers:
-        wrong = np.flatnonzero(rng.random(len(ids)) < sensing.outliers)
-        found, y = false_measurements(sensor, v[wrong], sizes[wrong], min(range_limit(sensor), things.extent()), rng)
-        e[wrong[found]] = y[found]
-        real = [None if i in wrong[found] else name for i, name in enumerate(real)]
-    kept = rng.random(len(ids)) >= (sensing.dropouts or 0.0)
-    swapped: dict[Id, Id] = dict([*sensing.swapped, *((b, a) for a, b in sensing.swapped)])
-    rows = [i for i, name in enumerate(ids) if kept[i] and name not in sensing.hidden]
-    reported = [swapped.get(ids[i], ids[i]) for i in rows]
-    return Sighted(v[rows], e[rows], sizes[rows], reported), [real[i] for i in rows]
+        wrong = late[rng.random(len(late)) < sensing.outliers]
+        reach_m = min(range_limit(sensor), things.extent())
+        found, y = false_measurements(sensor, seen.v[wrong], seen.sizes[wrong], reach_m, rng)
+        seen.e[wrong[found]], seen.real[wrong[found]] = y[found], 0
+    told, kept = seen.ids[late], np.ones(len(seen.ids), dtype=np.bool_)
+    kept[late] = (rng.random(len(late)) >= (sensing.dropouts or 0.0)) & ~np.isin(told, sensing.hidden)
+    for name, other in dict([*sensing.swapped, *((b, a) for a, b in sensing.swapped)]).items():
+        seen.ids[late[told == name]] = other
+    return seen.rows(np.flatnonzero(kept))
 
 
 def false_measurements(sensor: Any, v: Array, sizes: Array, reach_m: float, rng: Generator) -> tuple[Flags, Array]:
@@ -275,7 +316,10 @@ def false_measurements(sensor: Any, v: Array, sizes: Array, reach_m: float, rng:
         missing = np.flatnonzero(~found)
         if not len(missing):
             break
-        places = in_ball(len(missing), 2 if plane else 3, reach_m, rng)
+        d = 2 if plane else 3
+        places = rng.standard_normal((len(missing), d))  # uniform in a ball: of any direction first
+        places /= np.linalg.norm(places, axis=1, keepdims=True)
+        places *= reach_m * rng.uniform(0.0, 1.0, (len(missing), 1)) ** (1.0 / d)
         moved = v[missing].copy()
         if sort == SEGMENTS:
             shift = places - centre(sort, moved, places.shape[1])
@@ -285,13 +329,6 @@ def false_measurements(sensor: Any, v: Array, sizes: Array, reach_m: float, rng:
         inside, y = exact_measurements(sensor, moved, sizes[missing])
         found[missing], e[missing[inside]] = inside, y[inside]
     return found, e
-
-
-def in_ball(count: int, dimensions: int, radius: float, rng: Generator) -> Array:
-    """Return points (count, dimensions) uniform in a ball about the origin."""
-    direction = rng.standard_normal((count, dimensions))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return radius * rng.uniform(0.0, 1.0, (count, 1)) ** (1.0 / dimensions) * direction
 
 
 def tags_seen(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Array]:
