@@ -243,7 +243,7 @@ def _bent(run: Run, without: Run) -> tuple[str, float]:
     (mine, sigmas), (places, _) = (r.landmarks.positions() for r in (run, without))
     names = [[str(i) for i in r.landmarks.ids] for r in (run, without)]
     if len(places) < NEEDED or len(mine) < NEEDED:
-        return WRONG, math.inf
+        return WRONG, 0.0
     at = np.array([names[1].index(name) if name in names[1] else -1 for name in names[0]])
     if (run.history.id == "").any():
         if len(run.history.poses) == len(without.history.poses):
@@ -253,7 +253,7 @@ def _bent(run: Run, without: Run) -> tuple[str, float]:
         at = np.where(np.isin(names[0], run.history.id), at, nearest)
     both = np.isfinite(mine).all(axis=1) & np.isfinite(places[at]).all(axis=1) & (at >= 0)
     if both.sum() < NEEDED:
-        return WRONG, math.inf
+        return WRONG, 0.0
     mine, twice, places = mine[both], len(at) - len(np.unique(at)), places[at[both]]
     off, sigma = np.linalg.norm(rigid(mine, places)(mine) - places, axis=1), _sigma(sigmas[both])
     off_m, extent_m = math.sqrt(float(np.mean(off**2))), rmse(places - places.mean(axis=0))

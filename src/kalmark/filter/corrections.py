@@ -49,6 +49,7 @@ from kalmark.filter.kernels import (
 )
 from kalmark.filter.observed_block import (
     Linear,
+    cost_of,
     diagonal_blocks,
     has_settled,
     head_sizes,
@@ -86,6 +87,7 @@ TO_CORRECT = (  # all but the last argument
     "Tuple((i8, i8, i8[::1], i8, f8[:, ::1], f8[:, :, ::1], f8))"
 )
 ROUNDS, SETTLED = 20, 0.01  # of Huber's weights, and by how much these may still change
+RISE = 0.01  # of a cost, by a step that is not halved
 call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
 _RETRACT, _GENERATOR, _ITERATE, _REGRESSION, _HEADING_LAST, _TURN_MATRICES, _CARRY, _DISPLACEMENT = range(8)
 _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8, 13)
@@ -162,20 +164,22 @@ def iterate(
     The first time is `linear`, at the mean.  `limits`: at most so many times, until nothing moves by more than that
     many of its sigmas.
 
+    If that ends where the `cost_of` the scan and the prior is more than at the mean, it goes on from where it was least
+    and halves each step that raises it.
+
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
     back where inverse distances are corrected by their parallax.
     """
     (_pose, head, axes, h, others, level), (most, tolerance) = sizes, limits
-    k = len(y)
+    k, p = len(y), R.shape[1]
     turning = turning_rows(table, sizes, linear[1])
     theta = turning[0]
-    correction, origin = np.zeros(len(P_ss)), mean[:3].copy()
+    correction, weights, origin = np.zeros(len(P_ss)), np.zeros(len(P_ss)), mean[:3].copy()
     R_r = rotation_at(mean, 0, axes)
     B = take_rows(P_ss, theta, len(P_ss))
     L = call_regression(ways[_REGRESSION], (B, theta, table, turning, axes, R_r, ways[_SPREAD] != 0))
     then = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
-    turn = np.zeros(axes)
     parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
     depths = inverse_distance_table(table if parallaxes else table[:0])
     v, H, HP, Z = linear
@@ -185,11 +189,25 @@ def iterate(
         s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
         rows = np.arange(S.shape[1])
         baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P_ss, rows, mean, s, S, depths)))
-        s_j, S_j = s, S
-    x_j, (E, W, d) = mean, call_turn_matrices(ways[_TURN_MATRICES], (turn, correction, turning, axes))
-    for j in range(most):
+    best, best_weights = correction, weights
+    first = least = cost = cost_of(v.reshape(k, p), R, correction, weights)
+    for j in range(2 * most):
+        if j == most:
+            if not cost > first:
+                break
+            correction, weights = best, best_weights
         if j > 0:
+            x_j, turn = mean.copy(), gauge(mean, correction, turning, axes)
+            step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, 3))
+            E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, step, turning, axes))
+            call_retract(ways[_RETRACT], (table, x_j, step, turn))
+            call_carry(ways[_CARRY], (table, x_j, L, W, d))
+            if len(depths):
+                s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
+                d_head = correction[: S.shape[1]]
+                parallax.call_retract(ways[_RETRACT_PARALLAX], (x_j, mean, baselines, correction, d_head, s_j))
             _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, (len(mean) - head) // k), y)
+            cost = cost_of(z, R, correction, weights)
             H, v = stack_jacobians(E_r, E_l, len(P_ss)), ravel(z)
             if len(depths):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
@@ -201,19 +219,15 @@ def iterate(
         M, positive = cholesky_inverse(Z)
         if not positive:
             break
-        before, correction = correction, least_squares(HP, M, v)
+        if cost < least:
+            best, best_weights, least = correction, weights, cost
+        elif j > most and cost > least + RISE:  # too long a step
+            correction, weights = 0.5 * (best + correction), 0.5 * (best_weights + weights)
+            continue
+        before = correction
+        correction, weights = least_squares(HP, H, M, v)
         if has_settled(table, correction, before, P_ss, tolerance):
             break
-        x_j = mean.copy()
-        turn = gauge(mean, correction, turning, axes)
-        step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, 3))
-        E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, step, turning, axes))
-        call_retract(ways[_RETRACT], (table, x_j, step, turn))
-        call_carry(ways[_CARRY], (table, x_j, L, W, d))
-        if len(depths):
-            s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
-            d_head = correction[: S.shape[1]]
-            parallax.call_retract(ways[_RETRACT_PARALLAX], (x_j, mean, baselines, correction, d_head, s_j))
     return H, M, v, positive
 
 
@@ -374,7 +388,7 @@ def robust_noise(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
         M, positive = cholesky_inverse(Z)
         if not positive:
             return R
-        step, changed = least_squares(HP, M, v), 0.0
+        step, changed = least_squares(HP, H, M, v)[0], 0.0
         for i in range(len(y)):
             for a in range(p):
                 r[i, a] = v[i * p + a]

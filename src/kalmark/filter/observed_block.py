@@ -286,20 +286,33 @@ def diagonal_blocks(Z: Array, p: int) -> Array:
 
 
 @compiled
-def least_squares(HP: Array, M: Array, v: Array) -> Array:
-    """Return P H' Z^-1 v for HP = H P (m, n) and M = L^-1, L L' = Z."""
+def least_squares(HP: Array, H: Array, M: Array, v: Array) -> tuple[Array, Array]:
+    """Return the step P H' Z^-1 v and H' Z^-1 v (n,) for H (m, n), HP = H P and M = L^-1, L L' = Z."""
     m, n = HP.shape
-    weights, step = np.zeros(m), np.zeros(n)
+    u, step, weights = np.zeros(m), np.zeros(n), np.zeros(n)
     for i in range(m):
-        u = 0.0
+        w = 0.0
         for j in range(i + 1):
-            u += M[i, j] * v[j]
+            w += M[i, j] * v[j]
         for j in range(i + 1):
-            weights[j] += M[i, j] * u
+            u[j] += M[i, j] * w
     for i in range(m):
         for j in range(n):
-            step[j] += weights[i] * HP[i, j]
-    return step
+            step[j] += u[i] * HP[i, j]
+            weights[j] += u[i] * H[i, j]
+    return step, weights
+
+
+@compiled
+def cost_of(z: Array, R: Array, step: Array, weights: Array) -> float:
+    """Return the cost z' R^-1 z + d' P^-1 d of innovations z (K, p) after a step d = P w (n,) from the prior mean.
+
+    It is infinite where nothing can be expected of an observation, NaN where its noise R (K, p, p) is singular.
+    """
+    cost = squared_distances(R, z)[0].sum()
+    for i in range(len(step)):
+        cost += step[i] * weights[i]
+    return cost
 
 
 @compiled
