@@ -14,6 +14,7 @@ import kalmark as km
 from batch_dense import Link, Sight, link, optimum
 from kalmark.batch.batch_state import POSES, BatchState, plus
 from kalmark.batch.data import replay_events
+from kalmark.batch.motion_chain import Chain
 from kalmark.batch.problem import Rows
 from kalmark.batch.solver import Batch
 from kalmark.config import build_slam, load_config, open_config_log
@@ -390,3 +391,16 @@ def test_readings_of_the_state_and_range_rates_are_not_in_the_batch_solution(nam
     run = record(build_slam(world.config(), log), log, progress=False, pictures=False)
     assert set(run.history.sensor.tolist()) > used
     assert set(batch_input(run).associations.sensor.tolist()) == used
+
+
+def test_the_control_in_force_where_a_segment_begins_moves_its_robot() -> None:
+    """A scan between two controls begins a segment: the way until the next control is that of the one before."""
+    chain = Chain({"r": km.Robot("r", km.motion.Unicycle())}, {}, {})
+    for k, u in enumerate([(1.0, 0.0), (2.0, 0.0), (0.5, 0.0)]):
+        chain.take(km.Control(float(k), "r", u))
+        if k == 1:
+            chain.lose("r")
+        chain.node_at("r", round((k + 0.25) * 1e9))
+    steps = [node.step[0] for node in chain.nodes]
+    assert [node.known for node in chain.nodes] == [True, True, False, True]
+    assert steps[-1] == pytest.approx(0.75 * 2.0 + 0.25 * 0.5)

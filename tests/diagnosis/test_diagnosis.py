@@ -21,6 +21,7 @@ from kalmark.batch.solver import optimum
 from kalmark.cli.app import main
 from kalmark.cli.run import run_log
 from kalmark.config import build_slam, config_dict
+from kalmark.diagnosis import single_ids
 from kalmark.diagnosis.batch_search import SEGMENT, subsample
 from kalmark.diagnosis.breakdown import breakdown, nees_parts
 from kalmark.diagnosis.cause_texts import OR, finding_text
@@ -543,7 +544,11 @@ def test_the_first_line_of_a_verdict_names_the_cause() -> None:
     assert next(verdict_lines(verdict)) == "the map is wrong because of bearing_sign"
 
 
-def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidnapped() -> None:
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidnapped(
+    share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no more than a share of the log is filtered at once, too."""
     log, config = log_of(), world_of().config()
     ids = [i for e in log.events if isinstance(e, Scan) for i in e.ids or ()]
     a, b = sorted({*ids}, key=lambda i: (-ids.count(i), i))[:2]
@@ -556,8 +561,10 @@ def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidn
 
     log = replace(log, events=[*map(swapped, log.events)])
     run = recorded_under(config, log, pictures=True)
+    monkeypatch.setattr(single_ids, "MOST_TRIED", int(share * len(run.history.d2)))
     verdict = km.diagnose(run)
-    assert (verdict.map, verdict.causes[0].name) == ("ok", "wrong_ids")
+    assert verdict.causes[0].name == "wrong_ids"
+    assert verdict.map == ("ok" if share == 1.0 else "doubtful"), "a part of the log says less of the map"
     assert verdict.causes[0].since_s == pytest.approx(begin * 1e-9, abs=2.0)
     assert f"what is called {a} is where {b} was" in verdict.causes[0].evidence
     # its score is half of the chi-square of what was filtered again, which is at most that of the whole run

@@ -104,3 +104,25 @@ def test_the_gate_can_be_chosen_or_left_away() -> None:
         slam.add_landmark(3, WRONG[3])
         report = slam.process(scan(0.0, np.zeros(3), [3], np.random.default_rng(0)))
         assert report.observations[0].outcome == fate
+
+
+def test_what_was_mapped_from_a_wrong_start_does_not_speak_against_surveys_that_come_one_at_a_time() -> None:
+    rng, start = np.random.default_rng(4), np.array([0.0, 0.0, 0.0])
+    trees = dict(enumerate(rng.uniform((-4, -6), (40, 6), (60, 2))))
+    trees |= {100: (10.0, 4.0), 101: (18.0, -4.0), 102: (25.0, 4.0)}
+    laser = km.Mount(km.sensors.RangeBearing(0.05, 0.01))
+    stated, cov = (4.0, -3.0, 0.4), np.diag((0.1, 0.1, 0.02)) ** 2
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle(0.05, 0.03), stated, {"l": laser}, cov=cov)])
+    for name in (100, 101, 102):
+        slam.add_landmark(name, trees[name])
+    pose, removed = start, []
+    for k in range(150):
+        slam.process(km.Control(0.2 * k, "r", (1.0, 0.0) + rng.normal(size=2) * (0.05, 0.03)))
+        pose = km.motion.Unicycle().move(pose, np.array([1.0, 0.0]), 0.2)[0]
+        y = km.geometry.observe(pose, np.array([*trees.values()]))[0]
+        near = np.flatnonzero((y[:, 0] < 7.0) & (np.abs(y[:, 1]) < 2.0))
+        seen = y[near] + rng.normal(size=(len(near), 2)) * (0.05, 0.01)
+        report = slam.process(km.Scan(0.2 * (k + 1), "r", "l", seen, [[*trees][i] for i in near]))
+        removed += [name for name, why in report.removed if why == ELSEWHERE]
+    assert removed == []
+    assert np.linalg.norm(slam.mean("r")[:2] - pose[:2]) < 0.5

@@ -7,6 +7,7 @@ log is filtered again: it is likelier if that is a place of its own.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from kalmark.logs.log import Log
 from kalmark.models.observe import linearize
 from kalmark.results.history import History, Ints, Texts, texts
 from kalmark.results.run import Run
-from kalmark.slam.state import State
+from kalmark.slam.slam import Slam
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 from kalmark.tracks.channel import Channel, ObservationModel
 
@@ -137,8 +138,8 @@ def _fit_others(first: Run, rows: Ints) -> Flags:
 
     Robots are where the run had them then, landmarks where it has them in the end.
     """
-    h, state, fit = first.history, first.final_slam().state, np.zeros(len(rows), dtype=np.bool_)
-    places = {key: _places(state, channel) for key, channel in state.channels.items()}
+    h, slam, fit = first.history, first.final_slam(), np.zeros(len(rows), dtype=np.bool_)
+    state, places = slam.state, {key: _places(slam, channel) for key, channel in slam.state.channels.items()}
     for i, k in enumerate(rows.tolist()):
         key = str(h.robot[h.step[k]]), str(h.sensor[k])
         channel = state.channels[key]
@@ -154,17 +155,13 @@ def _fit_others(first: Run, rows: Ints) -> Flags:
     return fit
 
 
-def _places(state: State, channel: Channel) -> list[tuple[ObservationModel, Texts, Array]]:
+def _places(slam: Slam, channel: Channel) -> list[tuple[ObservationModel, Texts, Array]]:
     """Return names (K,) and numbers (K, n) of the landmarks that a sensor can observe, by their models."""
-    tracks, found = state.tracks, list[tuple[ObservationModel, Texts, Array]]()
-    mapped, known = tracks.observable(channel), list(tracks.known)
-    for model, at in tracks.by_model(channel, mapped):
-        names = [mapped[i] for i in at]
-        found.append((model, texts(names), state.map.means(tracks.slots_of(names), model.d)))
-    for model, at in tracks.known_by_model(channel, known):
-        names = [known[i] for i in at]
-        found.append((model, texts(names), tracks.known.means(names)))
-    return found
+    table, of_kind = slam.landmarks(exactly_known=True), defaultdict[str, list[int]](list)
+    for k, kind in enumerate(table.kinds):
+        of_kind[kind].append(k)
+    models = [(channel.models[kind], rows) for kind, rows in of_kind.items() if kind in channel.models]
+    return [(model, texts([table.ids[k] for k in at]), np.array([table.means[k] for k in at])) for model, at in models]
 
 
 def _places_of_ids(

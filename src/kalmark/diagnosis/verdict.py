@@ -254,7 +254,7 @@ def _bent(run: Run, without: Run) -> tuple[str, float]:
     both = np.isfinite(mine).all(axis=1) & np.isfinite(places[at]).all(axis=1) & (at >= 0)
     if both.sum() < NEEDED:
         return WRONG, 0.0
-    mine, twice, places = mine[both], len(at) - len(np.unique(at)), places[at[both]]
+    mine, twice, places = mine[both], both.sum() - len(np.unique(at[both])), places[at[both]]
     off, sigma = np.linalg.norm(rigid(mine, places)(mine) - places, axis=1), _sigma(sigmas[both])
     off_m, extent_m = math.sqrt(float(np.mean(off**2))), rmse(places - places.mean(axis=0))
     wrong = twice + int(((off > SIGMAS * sigma) & (off > LEAST * extent_m)).sum())

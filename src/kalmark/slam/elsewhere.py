@@ -87,8 +87,8 @@ def correct(
         return done
     of = state.evidence.setdefault(scan.event.robot, Evidence())
     fits = np.flatnonzero(done.fused).tolist()
-    of.miss((names[k] for k in far), [-SURE] * len(far), scan.event.t_ns)
-    of.see((names[k] for k in fits), [SURE] * len(fits), scan.event.t_ns)
+    of.miss((names[k] for k in far), [-SURE] * len(far), scan.event.t_ns, state.is_surveyed)
+    of.see((names[k] for k in fits), [SURE] * len(fits), scan.event.t_ns, state.is_surveyed)
     of.weigh()
     out = [k for k in far if done.d2[k] <= update.gate]
     of.held += len(of.missed) >= SEVERAL and not of.fitted
@@ -121,7 +121,7 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
     of, all_named = state.evidence.get(robot), None not in scan.ids
     if of is None or not scan.report.observations:
         return
-    _note(scan, of, look)
+    _note(state, scan, of, look)
     if scan.adrift:
         of.ratio, of.since_ns = -SURE, state.moving[robot].held.adrift_since_ns
     if of.ratio >= 0.0 and all_named:
@@ -138,16 +138,16 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
         of.fitted = set()
 
 
-def _note(scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
+def _note(state: State, scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
     """Take note of the landmarks that a scan saw, missed and began."""
     made, t_ns = scan.report.observations, scan.event.t_ns
     if look is not None:
         log_miss = scan.tracks.looks[scan.key].log_miss()
-        of.miss(look.missed, [weight * log_miss for weight in look.missed.values()], t_ns)
+        of.miss(look.missed, [weight * log_miss for weight in look.missed.values()], t_ns, state.is_surveyed)
     seen = [o for o in made if o.outcome == "associated" and (look is not None or o.id is not None)]
     if seen:
         logs = _log_chance(scan, [o.index for o in seen], look.density if look is not None else 0.0)
-        of.see((o.landmark for o in seen if o.landmark is not None), -logs, t_ns)
+        of.see((o.landmark for o in seen if o.landmark is not None), -logs, t_ns, state.is_surveyed)
     of.begin((o.landmark for o in made if o.outcome == "new" and o.landmark is not None), t_ns)
     of.weigh()
 

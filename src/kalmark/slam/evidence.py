@@ -12,7 +12,7 @@ after it: those begun since then fit wherever the robot is.  The evidence is the
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -22,7 +22,7 @@ from kalmark.association.global_start import SURE
 from kalmark.events import Id
 
 MOST, RECENT = 64, 256  # landmarks that were missed last, and seen last, which outweigh all older ones
-NEVER_NS = -1
+NEVER_NS, MAPPED_NS = -1, 0  # when landmarks begin that were surveyed, and that were mapped before what is recorded
 
 
 @dataclass
@@ -48,16 +48,17 @@ class Evidence:
         """Take note of landmarks that were begun."""
         self.seen |= {name: (t_ns, t_ns, 0.0) for name in names}
 
-    def see(self, names: Iterable[Id], logs: Iterable[float], t_ns: int) -> None:
+    def see(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, surveyed: Callable[[Id], bool]) -> None:
         """Take note of landmarks that were seen where they are expected."""
         for name, log in zip(names, logs, strict=True):
-            self.seen[name] = self.seen.pop(name, (NEVER_NS,))[0], t_ns, min(float(log), SURE)  # the last one of all
+            begun = self.seen.pop(name, (NEVER_NS if surveyed(name) else MAPPED_NS,))[0]
+            self.seen[name] = begun, t_ns, min(float(log), SURE)  # the last one of all
             self.missed.pop(name, None)
 
-    def miss(self, names: Iterable[Id], logs: Iterable[float], t_ns: int) -> None:
+    def miss(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, surveyed: Callable[[Id], bool]) -> None:
         """Take note of landmarks that were not seen where they are expected, or elsewhere."""
         for name, log in zip(names, logs, strict=True):
-            last = self.seen.get(name, (NEVER_NS, NEVER_NS))[1]
+            last = self.seen[name][1] if name in self.seen else NEVER_NS if surveyed(name) else MAPPED_NS
             self.missed.setdefault(name, (last, t_ns, max(float(log), -SURE)))
         for name in [*self.missed][:-MOST]:
             del self.missed[name]

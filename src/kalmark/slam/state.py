@@ -239,6 +239,10 @@ class State:
         given.repeats, given.since_ns = given.repeats + 1, given.since_ns if given.repeats else t_ns
         return True
 
+    def is_surveyed(self, name: Id) -> bool:
+        """Return whether a landmark was given, and not mapped from here."""
+        return name in self.tracks.known or name in self.surveys.trial or name in self.surveys.trusted
+
     def settle(self) -> None:
         """Notify sources that something else than their scans changes the map."""
         for source in self.sources.values():
@@ -246,16 +250,16 @@ class State:
 
     def remove(self, name: Id) -> None:
         """Remove a landmark; its place goes to the next new one."""
-        self.surveys.forget(name)
         if name in self.tracks.known:
             self.tracks.known.remove(name)
-            return
-        slot = self.tracks.slot(name)
-        if name not in self.tracks.confirmed:
-            what = "robot" if name in self.robots else "sensor's mount or a control's bias"
-            raise MapError(f"{name!r} is a {what}, expected a landmark")
-        self.map.remove(slot)
-        self.tracks.remove(name)
+        else:
+            slot = self.tracks.slot(name)
+            if name not in self.tracks.confirmed:
+                what = "robot" if name in self.robots else "sensor's mount or a control's bias"
+                raise MapError(f"{name!r} is a {what}, expected a landmark")
+            self.map.remove(slot)
+            self.tracks.remove(name)
+        self.surveys.forget(name)
 
     def let_grow(self) -> None:
         """Compress the map as soon as that pays; not where matchings are averaged."""

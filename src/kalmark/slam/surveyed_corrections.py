@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate
@@ -56,9 +55,9 @@ def correct_by_surveys(
     trial, known = state.surveys.trial, state.tracks.known
     beyond = np.flatnonzero(~done.fused & ~np.isnan(done.d2)).tolist()
     tried = [name in trial or name in known for name in names]
-    of = state.evidence.get(scan.event.robot)
-    young = of.young if of is not None else set[Id]()  # these fit wherever the robot is
-    fitting = [names[k] for k in np.flatnonzero(done.fused & (done.d2 <= least)).tolist() if names[k] not in young]
+    fitting = [
+        names[k] for k in np.flatnonzero(done.fused & (done.d2 <= least)).tolist() if state.is_surveyed(names[k])
+    ]
     lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
     if elsewhere.concerns(scan) or ((lost or state.surveys.contradict()) and is_doubted(state, scan)):
         lost = False

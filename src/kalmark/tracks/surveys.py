@@ -2,7 +2,8 @@
 
 An observation outside its gate is left out, as a fix is.  Observations of two such landmarks with none between that
 fits show that the robot is elsewhere: those are used.  A landmark of which five sightings in a row do not fit, while
-those of twice as many landmarks do as do not, stands elsewhere: it is removed, and its next sighting maps it again.
+those of twice as many surveyed ones do as do not, stands elsewhere: it is removed, and its next sighting maps it again.
+Landmarks that were mapped from here say nothing: they fit wherever the robot is.
 """
 
 from __future__ import annotations
@@ -17,22 +18,25 @@ TRUSTED = 5  # observations that fit, after which it is right
 
 
 class Surveys:
-    """Test of surveys by observations.  `trial`: of landmarks in the map, how many sightings have fitted so far.
+    """Test of surveys by observations.
 
+    `trial`: of landmarks in the map, how many sightings have fitted so far.  `trusted`: those of which enough have.
     `misfits`: how many sightings in a row did not fit, and which landmarks did meanwhile.  `strangers`: by robot,
     the landmarks that did not fit since one did.
     """
 
     trial: dict[Id, int]
+    trusted: set[Id]
     misfits: dict[Id, tuple[int, frozenset[Id]]]
     strangers: dict[str, set[Id]]
 
     def __init__(self) -> None:
-        self.trial, self.misfits, self.strangers = {}, {}, {}
+        self.trial, self.trusted, self.misfits, self.strangers = {}, set(), {}, {}
 
     def forget(self, name: Id) -> None:
         """Forget a landmark."""
         self.trial.pop(name, None)
+        self.trusted.discard(name)
         self.misfits.pop(name, None)
         for names in self.strangers.values():
             names.discard(name)
@@ -45,6 +49,7 @@ class Surveys:
                 self.trial[name] += 1
                 if self.trial[name] >= TRUSTED:
                     del self.trial[name]
+                    self.trusted.add(name)
         if fitting:
             self.misfits = {name: (out, fit.union(fitting)) for name, (out, fit) in self.misfits.items()}
             self.strangers.pop(robot, None)
