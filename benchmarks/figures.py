@@ -97,6 +97,7 @@ def exactness() -> Iterator[Figure]:
         ("fitted lens correction, round trip over the image", ".01 px", "test_lenses"),
         ("compressed map against dense, 3,000 steps, 120 landmarks", "1e-8", "compressed_map_equals_the_dense"),
         ("inactive blocks of every space against the dense filter", "1e-9", "test_compressed_space"),
+        ("bearings of near things from steps of 1 m: worlds of ten in which the path is within .5 m", "9", "near_things"),
     ):  # fmt: skip
         yield Figure("Exactness", name, wanted, f"python -m pytest tests -k {words}", passes)
     for mount in ("known", "5 cm and 1.5 deg", "20 cm and 9 deg"):

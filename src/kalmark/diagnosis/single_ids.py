@@ -142,6 +142,8 @@ def _fit_others(first: Run, rows: Ints) -> Flags:
     state, places = slam.state, {key: _places(slam, channel) for key, channel in slam.state.channels.items()}
     for i, k in enumerate(rows.tolist()):
         key = str(h.robot[h.step[k]]), str(h.sensor[k])
+        if key not in places:  # a sensor of the state
+            continue
         channel = state.channels[key]
         head = channel.head(state.map, state.moving[key[0]].slot)
         head[: len(channel.at)] = h.poses[h.step[k]]

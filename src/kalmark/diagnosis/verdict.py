@@ -193,6 +193,7 @@ def _with_cure(
     """
     steady = _steady(verdict)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
+    doubted |= any(f.name == LATE for f in steady[:TRIED])  # of no other is the size so far from linear
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
     for n in range(ROUNDS if len(run.history.d2) <= MOST and (doubted or also) else 0):
         tried = [without_error(*at, f) for f in (steady[:1] if n else (*also, *steady[:TRIED]))]
