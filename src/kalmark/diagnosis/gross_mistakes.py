@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -36,12 +37,12 @@ from kalmark.logs.progress import track
 from kalmark.results.figure_texts import figure
 from kalmark.results.history import RobotStart
 from kalmark.results.measures import Rigid, level, level_sigmas, rmse
+from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 
 FEW_SCANS = 80  # of them at first: a log that does not fit shows it soon
 MUCH = 3.0  # times better is the log without the mistake
-REJECTED = 0.5  # of the fixes, from which on their robot is not where it should be
-LEAST_FIXES = 5
+LEAST_FIXES = 5  # in a row that do not fit: their robot is not where it should be
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
 STEPS = (-4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)  # by which scans may be late
 
@@ -126,12 +127,13 @@ def misfits_from(now: Fit) -> int | None:
 
 
 def find_wrong_starts(run: Run, log: Log) -> Mistake | None:
-    """Return that robots start elsewhere, or turned, if most of their fixes were rejected and then fit.
+    """Return that robots start elsewhere, or turned, if fixes in a row were rejected and then fit.
 
     The path of each robot without fixes and the others, moved about the vertical axis onto its fixes, has the start.
     """
     events, config, told, begin_s = first_events(run, log), run.config, [], math.inf
-    lost = [start for start in run.history.starts if _used(run, start.robot) <= 1.0 - REJECTED]
+    again = restarts(run.history)  # of these the map was moved onto their fixes
+    lost = [start for start in run.history.starts if start.robot not in again and _is_lost(run, start.robot)]
     for start in lost:
         found = _onto_its_fixes(run, log, events, start)
         if found is not None:
@@ -139,7 +141,7 @@ def find_wrong_starts(run: Run, log: Log) -> Mistake | None:
             told.append(words)
             begin_s = min(begin_s, start.t_ns * 1e-9)
     after = filter_events(config, log, events) if told else None
-    if after is None or fit_of_run(after).mean > FITS or any(_used(after, start.robot) <= REJECTED for start in lost):
+    if after is None or fit_of_run(after).mean > FITS or any(_is_lost(after, start.robot) for start in lost):
         return None
     gain = likelihood_gain(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
     evidence, cure = (sep.join(parts) for sep, parts in zip(("; ", " "), zip(*told, strict=True), strict=True))
@@ -167,10 +169,10 @@ def _onto_its_fixes(run: Run, log: Log, events: list[Event], start: RobotStart) 
     return onto, y, float(np.mean([np.diag(e.cov) for e in seen]))
 
 
-def _used(run: Run, robot: str) -> float:
-    """Return the share of a robot's fixes that the filter used; all of few."""
+def _is_lost(run: Run, robot: str) -> bool:
+    """Return whether the filter left out so many of a robot's fixes in a row."""
     used = [fix.used for fix in run.history.fixes if fix.robot == robot]
-    return float(np.mean(used)) if len(used) >= LEAST_FIXES else 1.0
+    return max((len([*row]) for fits, row in groupby(used) if not fits), default=0) >= LEAST_FIXES
 
 
 def _alone(events: list[Event], robot: str, robots: Sequence[str]) -> Iterator[Event]:

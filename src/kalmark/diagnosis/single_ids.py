@@ -86,13 +86,12 @@ def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | N
     rest = np.flatnonzero(out & ~np.isin(first.history.id, wrong))
     of_others = _of_others(first, rest) if len(rest) >= LEAST else 0.0
     mixed = of_others > SURELY * mean
-    if found is not None and not mixed:
-        cured = found[0]._replace(cure=cure, gain=gain + more), Filtered(found[1], log)
-        return cured if gain + more > SURELY * mean else None
     gain += more + (of_others if mixed else 0.0)
     by_itself = before.mean < FITS and -math.log(1.0 - GATE) * float(out.sum()) > SURELY * mean
     if gain < SURELY * mean and not by_itself:  # the filter may have left it out, which chance does seldom
         return None
+    if found is not None and not mixed:
+        return found[0]._replace(cure=cure, gain=max(gain, 0.0)), Filtered(found[1], log)
     evidence = f"{out.mean():.1%} of the observations are far off where their landmark is"
     name, cure, told = (TWICE, cure, ANOTHER) if mixed else (OUTLIERS, CURE, "")
     without = first if found is None else found[1]

@@ -3,7 +3,7 @@
 An observation outside its gate is left out, as a fix is.  Observations of two such landmarks with none between that
 fits show that the robot is elsewhere: those are used.  A landmark of which five sightings in a row do not fit, while
 those of twice as many surveyed ones do as do not, stands elsewhere: it is removed, and its next sighting maps it again.
-Landmarks that were mapped from here say nothing: they fit wherever the robot is.
+Landmarks that were mapped from here do not count: they fit wherever the robot is.
 """
 
 from __future__ import annotations
