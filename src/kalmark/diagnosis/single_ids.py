@@ -23,6 +23,7 @@ from kalmark.events import Event, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.logs.log import Log
 from kalmark.models.observe import linearize
+from kalmark.results.control_gaps import while_lost
 from kalmark.results.history import History, Ints, Texts, texts
 from kalmark.results.run import Run
 from kalmark.slam.slam import Slam
@@ -199,8 +200,11 @@ def _since_s(run: Run, rows: Ints) -> float:
 
 
 def _elsewhere(h: History) -> Flags:
-    """Return which sightings (O,) do not fit where their ids are at the end; these may have been begun again there."""
-    out = (h.outcome == "rejected") & (h.id != "")
+    """Return which sightings (O,) do not fit where their ids are at the end; these may have been begun again there.
+
+    Those of a robot that is elsewhere do not count.
+    """
+    out = (h.outcome == "rejected") & (h.id != "") & ~while_lost(h)[h.step]
     for change in (c for c in h.changes if c.reason == BEGUN_AGAIN):
         out ^= (h.id == str(change.landmark)) & (h.step <= change.step)
     return np.asarray(out)
