@@ -87,7 +87,7 @@ TO_CORRECT = (  # all but the last argument
     "Tuple((i8, i8, i8[::1], i8, f8[:, ::1], f8[:, :, ::1], f8))"
 )
 ROUNDS, SETTLED = 20, 0.01  # of Huber's weights, and by how much these may still change
-RISE = 0.01  # of a cost, by a step that is not halved
+RISE = 0.01  # by which a step may raise the cost before it is halved
 call_retract, call_generator, call_iterate = by_address(RETRACT), by_address(GENERATOR), by_address(ITERATE)
 _RETRACT, _GENERATOR, _ITERATE, _REGRESSION, _HEADING_LAST, _TURN_MATRICES, _CARRY, _DISPLACEMENT = range(8)
 _SENSOR_AT, _SPREAD, _RETRACT_PARALLAX, _CARRY_BACK, _TRANSPORT_PARALLAX = range(8, 13)
@@ -165,7 +165,7 @@ def iterate(
     many of its sigmas.
 
     If that ends where the `cost_of` the scan and the prior is more than at the mean, it goes on from where it was least
-    and halves each step that raises it.
+    and halves each step that raises it (docs/invariant.md).
 
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
     those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
@@ -193,7 +193,7 @@ def iterate(
     first = least = cost = cost_of(v.reshape(k, p), R, correction, weights)
     for j in range(2 * most):
         if j == most:
-            if not cost > first:
+            if not cost > first:  # or a noise is singular, and the cost NaN
                 break
             correction, weights = best, best_weights
         if j > 0:

@@ -168,9 +168,9 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
         sensor_columns={(r.name, name): s.columns for r in robots for name, s in r.sensors.items()},
     )  # fmt: skip
     mounts = {(r.name, name): s.at for r in robots for name, s in r.sensors.items()}
-    carried_ = {(r.name, name): s.sensor for r in robots for name, s in r.sensors.items()}
+    true_sensors = {(r.name, name): s.sensor for r in robots for name, s in r.sensors.items()}
     constants = {r.name: r.constants for r in robots}
-    return Simulation(log, {r.name: r.states for r in robots}, mounts, origins, constants, carried_)
+    return Simulation(log, {r.name: r.states for r in robots}, mounts, origins, constants, true_sensors)
 
 
 def scenery_of(world: World, rng: Generator) -> dict[str, Things]:
