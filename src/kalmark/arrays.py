@@ -18,3 +18,9 @@ def block_diagonal(blocks: Sequence[Array]) -> Array:
         out[i : i + m, j : j + n] = block
         i, j = i + m, j + n
     return out
+
+
+def diagonal_blocks(P: Array, d: int) -> Array:
+    """Return the blocks (K, d, d) on the diagonal of P (K d, K d)."""
+    k = len(P) // d
+    return P.reshape(k, d, k, d)[np.arange(k), :, np.arange(k)]

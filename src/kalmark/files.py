@@ -7,6 +7,7 @@ to one place: the one that comes last stays.  A temporary file of a killed progr
 from __future__ import annotations
 
 import bz2
+import csv
 import ctypes
 import errno
 import glob
@@ -18,7 +19,7 @@ import shutil
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatch
 from functools import partial
@@ -42,6 +43,13 @@ MOST_PACKED = 100  # times its own size that it may unpack to beyond that: resul
 def write(path: Path, text: str) -> None:
     """Write a text file so that it is there completely or not at all."""
     replace_file(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return the text of a CSV file; numbers have as many digits as they need to be read back as they are."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([header, *rows])
+    return out.getvalue()
 
 
 def replace_file(path: Path, writer: Callable[[Path], Any]) -> None:

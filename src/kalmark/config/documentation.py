@@ -70,30 +70,36 @@ no gate).
 def page() -> str:
     """Return the page as Markdown."""
     of_sensor = "`robots.NAME.sensors.SENSOR"
-    parts = [HEAD.format(names=", ".join(f"`{n}`" for n in shipped_configs()))]
-    parts += [_section("The file", schema.Config)]
-    parts += [_section("`log`", schema.LogConfig), _options(), _choice("`log.topics.TOPIC`, of a bag", "topic")]
-    parts += [_section("`robots.NAME`", schema.RobotConfig)]
-    parts += [_section("`robots.NAME.start`, in the plane", schema.StartConfig)]
-    parts += [_section("`robots.NAME.start`, in space", schema.SpaceStartConfig)]
-    parts += [_choice("`robots.NAME.motion`", "motion"), _section(f"{of_sensor}`", schema.Mounted)]
     keys = (f"| `{key}` | {load('keys', key).__doc__} |" for key in entry_points_of("keys"))
-    parts += ["\n".join(("Keys of plug-ins:\n\n| key | meaning |\n|---|---|", *keys, ""))]
-    parts += [_section(f"{of_sensor}`, in the plane, too", schema.PlaneMounted, schema.Mounted)]
-    parts += [_section(f"{of_sensor}`, in space, too", schema.SpaceMounted, schema.Mounted)]
-    parts += [
-        _choice(f"{of_sensor}`, in {there}", "sensor", w) for there, w in (("the plane", "plane"), ("space",) * 2)
+    parts = [
+        HEAD.format(names=", ".join(f"`{n}`" for n in shipped_configs())),
+        _section("The file", schema.Config),
+        _section("`log`", schema.LogConfig),
+        _options(),
+        _choice("`log.topics.TOPIC`, of a bag", "topic"),
+        _section("`robots.NAME`", schema.RobotConfig),
+        _section("`robots.NAME.start`, in the plane", schema.StartConfig),
+        _section("`robots.NAME.start`, in space", schema.SpaceStartConfig),
+        _choice("`robots.NAME.motion`", "motion"),
+        _section(f"{of_sensor}`", schema.Mounted),
+        "\n".join(("Keys of plug-ins:\n\n| key | meaning |\n|---|---|", *keys, "")),
+        _section(f"{of_sensor}`, in the plane, too", schema.PlaneMounted, schema.Mounted),
+        _section(f"{of_sensor}`, in space, too", schema.SpaceMounted, schema.Mounted),
+        _choice(f"{of_sensor}`, in the plane", "sensor", "plane"),
+        _choice(f"{of_sensor}`, in space", "sensor", "space"),
+        _choice(f"{of_sensor}.detector`", "detector"),
+        _section(f"{of_sensor}.mount`, in the plane", schema.MountConfig),
+        _choice(f"{of_sensor}.initialization`", "initialization"),
+        _section(f"{of_sensor}.mount`, in space", schema.SpaceMountConfig),
+        _section(f"{of_sensor}.attention`", section_of("attention", "attention")),
+        _choice("`landmarks`, and `landmark` of a sensor", "landmark"),
+        _choice("`association`, also of a sensor", "association"),
+        _section("`upkeep`, also of a sensor", section_of("upkeep", "upkeep")),
+        _choice("`estimator`", "estimator"),
+        _section("`map`", schema.MapConfig),
+        _section("`picture`", section_of("picture", "picture")),
     ]
-    parts += [_choice(f"{of_sensor}.detector`", "detector")]
-    parts += [_section(f"{of_sensor}.mount`, in the plane", schema.MountConfig)]
-    parts += [_choice(f"{of_sensor}.initialization`", "initialization")]
-    parts += [_section(f"{of_sensor}.mount`, in space", schema.SpaceMountConfig)]
-    parts += [_section(f"{of_sensor}.attention`", section_of("attention", "attention"))]
-    parts += [_choice("`landmarks`, and `landmark` of a sensor", "landmark")]
-    parts += [_choice("`association`, also of a sensor", "association")]
-    parts += [_section("`upkeep`, also of a sensor", section_of("upkeep", "upkeep"))]
-    parts += [_choice("`estimator`", "estimator"), _section("`map`", schema.MapConfig)]
-    return "\n".join([*parts, _section("`picture`", section_of("picture", "picture"))])
+    return "\n".join(parts)
 
 
 def _section(title: str, model: type[BaseModel], common: type[BaseModel] = Section) -> str:

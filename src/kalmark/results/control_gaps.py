@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import itemgetter
 
 import numpy as np
 
 from kalmark.arrays import Flags
 from kalmark.report import ELSEWHERE, Gap
 from kalmark.results.figure_texts import Figures, Summary, count, figure
-from kalmark.results.history import History
+from kalmark.results.history import History, grouped
 from kalmark.results.measures import place_sigma
 from kalmark.results.recording import Recording
 
@@ -89,8 +90,7 @@ def carried_line(gap: Summary) -> str:
 def controls_left_out(summary: Summary) -> Iterator[tuple[float, str]]:
     """Yield of each robot the time, s of the log, and a line of the controls that were beyond its limits."""
     odd = [gap for gap in summary.get("gaps", ()) if gap["kind"] == RULED_OUT]
-    for robot in dict.fromkeys(gap["robot"] for gap in odd):
-        mine = [gap for gap in odd if gap["robot"] == robot]
+    for robot, mine in grouped(odd, itemgetter("robot")).items():
         begin_s, often = mine[0]["start_s"], count(len(mine), "time")
         yield (
             begin_s,
@@ -103,8 +103,7 @@ def gap_notes(gaps: list[Figures]) -> Iterator[str]:
     yield from (line for _, line in controls_left_out({"gaps": gaps}))
     yield from (carried_line(gap) for gap in gaps if gap["kind"] == ELSEWHERE)
     noted = [gap for gap in gaps if is_reported(gap) and gap["kind"] in KINDS]
-    for robot in dict.fromkeys(gap["robot"] for gap in noted):
-        mine = [gap for gap in noted if gap["robot"] == robot]
+    for robot, mine in grouped(noted, itemgetter("robot")).items():
         longest = max(mine, key=lambda gap: gap["end_s"] - gap["start_s"])
         lasts, turn = longest["end_s"] - longest["start_s"], np.degrees(longest["sigma_rad"])
         what = "is held too long" if longest["kind"] == "held" else "stops"

@@ -283,7 +283,7 @@ def line_figures(landmarks: MapLandmarks, truth: Truth) -> Figures:
 
     Across the lines: along them nothing is known.  Nothing is aligned.
     """
-    d = 3 if landmarks.in_space else 2
+    d = landmarks.d
     true = {str(i): l.reshape(2, d) for i, l in truth.landmarks_in_map().items() if len(l) == 2 * d}
     if not true:
         return {}

@@ -83,9 +83,8 @@ def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any
     """Return the scene of a filter now; the arguments are those of `draw`."""
     picture.check_colours(slam.robots)
     world, names, whole = picture.ellipses != "shape", tuple(slam.robots), MapLandmarks.of(slam)
-    d = 3 if whole.in_space else 2
+    d, exact = whole.d, whole.split()[1]
     size = 3 if d == 2 else 7
-    exact = whole.split()[1]
     robots = np.array([slam.covariance(name)[:d, :d] for name in names])
     if not world:
         whole, robots = whole.shape(slam, names)

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from kalmark.arrays import Array, Index
+from kalmark.arrays import Array, Index, diagonal_blocks
 
 ROUNDS, SAME = 10, 1e-6  # until the weights are those of the shape
 REGULAR = 1e-15
@@ -49,8 +49,8 @@ class Datum(NamedTuple):
         q = 3 * (d - 1)
         free = la.null_space(generators(fixed, origin)[:, :d].reshape(-1, q)) if len(fixed) else np.eye(q)
         G = generators(points, origin)[:, :d] @ free
-        seen, own = across @ G, np.einsum("kij,kji->k", across, _blocks(P, d))
-        v = np.trace(_blocks(P, d), axis1=1, axis2=2)
+        seen, own = across @ G, np.einsum("kij,kji->k", across, diagonal_blocks(P, d))
+        v = np.trace(diagonal_blocks(P, d), axis1=1, axis2=2)
         for _ in range(ROUNDS):
             weighted = seen / (v + _lower_quartile(v) + EXACT_M**2)[:, None, None]
             w, V = np.linalg.eigh(np.einsum("kia,kib->ab", weighted, seen))
@@ -70,7 +70,9 @@ class Datum(NamedTuple):
 
         C (..., m, n) are the covariances with the points of the datum.
         """
-        return _moved(P, G, X, self.L)
+        both = X @ G.swapaxes(-1, -2)
+        out = P - both - both.swapaxes(-1, -2) + G @ self.L @ G.swapaxes(-1, -2)
+        return np.asarray((out + out.swapaxes(-1, -2)) / 2)
 
 
 def generators(points: Array, origin: Array) -> Array:
@@ -102,17 +104,4 @@ def shape_of_points(points: Array, P: Array, of: Index) -> Array:
     rows = (of[:, None] * d + np.arange(d)).ravel()
     datum = Datum.of(points[of], np.tile(np.eye(d), (len(of), 1, 1)), P[np.ix_(rows, rows)], np.empty((0, d)))
     C = P[:, rows].reshape(len(points), d, -1)
-    return datum.shape(generators(points, datum.origin)[:, :d], _blocks(P, d), C @ datum.T.T)
-
-
-def _moved(P: Array, G: Array, X: Array, L: Array) -> Array:
-    """Return P - X G' - G X' + G L G'."""
-    both = X @ G.swapaxes(-1, -2)
-    out = P - both - both.swapaxes(-1, -2) + G @ L @ G.swapaxes(-1, -2)
-    return np.asarray((out + out.swapaxes(-1, -2)) / 2)
-
-
-def _blocks(P: Array, d: int) -> Array:
-    """Return the diagonal blocks (K, d, d) of P (K d, K d)."""
-    k = len(P) // d
-    return P.reshape(k, d, k, d)[np.arange(k), :, np.arange(k)]
+    return datum.shape(generators(points, datum.origin)[:, :d], diagonal_blocks(P, d), C @ datum.T.T)

@@ -7,7 +7,7 @@ and matrices of several sizes padded with NaN.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import compress
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
@@ -33,6 +33,7 @@ Matrix = Annotated[Array, 2]
 Names = tuple[str, ...]
 Size = tuple[float, float]
 R = TypeVar("R", bound=tuple[Any, ...])
+K, V = TypeVar("K"), TypeVar("V")
 
 TYPES: dict[Any, Any] = {int: np.int64, bool: np.bool_, float: np.float64, str: np.str_}
 
@@ -72,6 +73,11 @@ class UsedFix(NamedTuple):
     z: Vector
     Z: Matrix
     moved_m: float = 0.0
+
+    @property
+    def d2(self) -> float:
+        """The normalised innovation squared."""
+        return float(self.z @ np.linalg.solve(self.Z, self.z))
 
 
 class RelocatedRobot(NamedTuple):
@@ -388,7 +394,20 @@ class History:
     @property
     def of_own(self) -> Flags:
         """Flags (O,) of the readings of a robot itself, by a sensor of its state."""
-        return np.asarray(self.landmark == self.robot[self.step])
+        return np.asarray(self.landmark == self.observers)
+
+    @property
+    def observers(self) -> Texts:
+        """The robots (O,) that made the observations."""
+        return self.robot[self.step]
+
+    def sensor_keys(self) -> list[tuple[str, str]]:
+        """Return the robot and the sensor of each observation (O of them)."""
+        return list(zip(self.observers.tolist(), self.sensor.tolist(), strict=True))
+
+    def made_by(self, robot: str, sensor: str) -> Flags:
+        """Return which observations (O,) a sensor of a robot made."""
+        return np.asarray((self.observers == robot) & (self.sensor == sensor))
 
     @property
     def localizes(self) -> bool:
@@ -506,6 +525,14 @@ class History:
 
 def _array_fields() -> list[str]:
     return [f.name for f in fields(History) if f.name not in ("maps", "controls", "stepped", *ROWS)]
+
+
+def grouped(rows: Iterable[V], key: Callable[[V], K]) -> dict[K, list[V]]:
+    """Return rows by their keys, both in their order."""
+    found: dict[K, list[V]] = {}
+    for row in rows:
+        found.setdefault(key(row), []).append(row)
+    return found
 
 
 def as_id(text: str) -> Id:

@@ -16,6 +16,7 @@ __all__ = ["name_points"]
 
 GAP = 3.0  # points of paper between a point and its name
 SIDES = np.array([[0, 1], [0, -1], [1, 0], [-1, 0], [1, 1], [-1, 1], [1, -1], [-1, -1]], dtype=np.float64)
+DIGITS = 3  # of a pixel's area: what covers less is free, so that rounding does not choose between free places
 FARTHER = (1.0, 2.0)  # times that distance of a name; farther only where the near places are taken
 
 
@@ -71,7 +72,7 @@ def _place(labels: list[_Label], renderer: Any) -> None:
         boxes = np.hstack([at[k] + offsets - half[k], at[k] + offsets + half[k]])
         inside = _common(boxes, frame)[:, 0]
         covered = _common(boxes, np.delete(taken, k, axis=0)).sum(axis=1) + (4 * half[k].prod() - inside)
-        best = int(covered.argmin())
+        best = int(covered.round(DIGITS).argmin())
         each.set_position(tuple(offsets[best] / pixels))
         taken = np.vstack([taken, boxes[best]])
 

@@ -18,7 +18,6 @@ lines by `endpoints` at the abscissas of their ends (`kalmark.models.protocols.H
 from __future__ import annotations
 
 import csv
-import io
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,6 +31,7 @@ from kalmark.arrays import Array, block_diagonal
 from kalmark.declare import is_own
 from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
+from kalmark.files import csv_text
 from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
 from kalmark.models.landmarks import Point2D, PointHeight2D, Wall2D
 from kalmark.models.protocols import Landmark, Segmented, place_of
@@ -52,6 +52,7 @@ _POINT = ("x_m", "y_m", "z_m")
 _PLANE = {"point_signature": (*_POINT[:2], "signature"), "point_height": _POINT, "wall": ("x_m", "y_m", "x2_m", "y2_m")}
 _LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
 _TAG = (*_POINT, "qx", "qy", "qz", "qw")
+_PLACES = (*_LINE, *_TAG[3:], "signature")
 _SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
 _ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
 
@@ -193,6 +194,11 @@ class MapLandmarks:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def d(self) -> int:
+        """The dimensions of the robots' world, 2 or 3."""
+        return 3 if self.in_space else 2
+
     @classmethod
     def of(cls, slam: Slam, *, exactly_known: bool = True) -> MapLandmarks:
         """Return the places of the landmarks of a filter's map, and of those known exactly beside it."""
@@ -219,8 +225,7 @@ class MapLandmarks:
 
         The datum are at most `DATUM` landmarks, evenly chosen by their certainty.
         """
-        d = 3 if self.in_space else 2
-        points, P = self.positions()
+        d, (points, P) = self.d, self.positions()
         exact = np.array([name in self.exact for name in self.ids], dtype=np.bool_)
         sigma = np.where(np.isfinite(points).all(axis=1) & ~exact, np.trace(P, axis1=1, axis2=2), np.inf)
         order = np.argsort(sigma, kind="stable")[: np.isfinite(sigma).sum()]
@@ -266,7 +271,7 @@ class MapLandmarks:
 
     def positions(self) -> tuple[Array, Array]:
         """Return the positions (K, d) and their covariances (K, d, d), of lines their first endpoints."""
-        d = 3 if self.in_space else 2
+        d = self.d
         means = np.array([mean[:d] for mean in self.means]).reshape(-1, d)
         return means, np.array([cov[:d, :d] for cov in self.covariances]).reshape(-1, d, d)
 
@@ -286,30 +291,25 @@ class MapLandmarks:
         If there are any known exactly, `known` is "exactly" in their rows; if any were looked at again, there are the
         `log_odds` that they exist, and `mark` is "not seen again" of those that were not where they should be.
         """
-        axes = [
-            _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
-            for kind, mean in zip(self.kinds, self.means, strict=True)
-        ]
-        columns = list(dict.fromkeys(name for names in axes for name in names))
-        columns = columns or list(_POINT if self.in_space else _POINT[:2])
-        errors = {_errors(names) for names in axes} or {_errors(columns)}
-        used = {pair for names in errors for pair in combinations_with_replacement(names, 2)}
-        pairs = [pair for pair in combinations_with_replacement(_ERRORS, 2) if pair in used]
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        more = ["known"] * bool(self.exact) + ["log_odds", "mark"] * bool(self.log_odds)
-        writer.writerow(["id", "kind", *columns, *(_cov_name(a, b) for a, b in pairs), "observations", *more])
-        for i, names in enumerate(axes):
-            at, row = ({name: j for j, name in enumerate(of)} for of in (names, _errors(names)))
-            mean = [repr(float(self.means[i][at[name]])) if name in at else "" for name in columns]
-            cov = [repr(float(self.covariances[i][row[a], row[b]])) if {a, b} <= row.keys() else "" for a, b in pairs]
-            name = self.ids[i]
-            more = ["exactly" if name in self.exact else ""] if self.exact else []
-            if self.log_odds:
-                odds = repr(float(self.log_odds[name])) if name in self.log_odds else ""
-                more += [odds, UNSEEN if name in self.unseen else ""]
-            writer.writerow([name, self.kinds[i], *mean, *cov, self.observations[i], *more])
-        return out.getvalue()
+        rows = [self._cells(k) for k in range(len(self))]
+        usual = _POINT if self.in_space else _POINT[:2]
+        used = dict.fromkeys(name for row in rows for name in row) or dict.fromkeys((*usual, *_cov_names(usual)))
+        header = ["id", "kind", *(name for name in used if name in _PLACES)]
+        header += [*(name for name in _cov_names(_ERRORS) if name in used), "observations"]
+        header += ["known"] * bool(self.exact) + ["log_odds", "mark"] * bool(self.log_odds)
+        return csv_text(header, ([row.get(name, "") for name in header] for row in rows))
+
+    def _cells(self, k: int) -> dict[str, Any]:
+        """Return the cells of a row by column."""
+        name, kind, mean, P = self.ids[k], self.kinds[k], self.means[k], self.covariances[k]
+        axes = _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
+        errors = _errors(axes)
+        cells = {"id": name, "kind": kind, "observations": self.observations[k]}
+        cells |= zip(axes, mean.tolist(), strict=False)
+        cells |= zip(_cov_names(errors), P[np.triu_indices(len(errors))].tolist(), strict=True)
+        cells |= {"known": "exactly"} if name in self.exact else {}
+        cells |= {"log_odds": float(self.log_odds[name])} if name in self.log_odds else {}
+        return cells | ({"mark": UNSEEN} if name in self.unseen else {})
 
     @classmethod
     def read(cls, path: Path) -> MapLandmarks:
@@ -320,11 +320,10 @@ class MapLandmarks:
             plane, odds, unseen = False, dict[Id, float](), set[Id]()
             for number, row in enumerate(rows, start=2):
                 try:
-                    names = [name for name in (*_LINE, *_TAG[3:], "signature") if row.get(name)]
+                    names = [name for name in _PLACES if row.get(name)]
                     errors = _errors(names)
-                    cov = np.empty((len(errors), len(errors)))
-                    for (i, a), (j, b) in combinations_with_replacement(enumerate(errors), 2):
-                        cov[i, j] = cov[j, i] = float(row[_cov_name(a, b)])
+                    cov, (i, j) = np.empty((len(errors),) * 2), np.triu_indices(len(errors))
+                    cov[i, j] = cov[j, i] = [float(row[name]) for name in _cov_names(errors)]
                     table.ids.append(as_id(row["id"]))
                     table.kinds.append(row["kind"])
                     plane |= row["kind"] == PointHeight2D.kind or not row.get("z_m")
@@ -360,5 +359,7 @@ def _errors(names: Sequence[str]) -> tuple[str, ...]:
     return (*(name for name in names if not name.startswith("q")), *turn)
 
 
-def _cov_name(a: str, b: str) -> str:
-    return "cov_" + "".join(name[0] if name == "signature" else name.partition("_")[0] for name in (a, b))
+def _cov_names(errors: Sequence[str]) -> list[str]:
+    """Return the columns of the upper triangle of the covariance of an error, row by row."""
+    letters = [name[0] if name == "signature" else name.partition("_")[0] for name in errors]
+    return ["cov_" + "".join(pair) for pair in combinations_with_replacement(letters, 2)]

@@ -191,41 +191,39 @@ def strokes(scene: Scene) -> list[Stroke]:
     """Return all that is drawn of a scene, in the order of the legend."""
     several, crowded = len(scene.ways) > 1, len(scene.ids) > CROWD
     gaps = " (dotted: no scans, or lost)" if any(way.dotted.any() for way in scene.ways.values()) else ""
-    out = []
+    paths = []
     for robot, way in scene.ways.items():
         thick = 0.8 if len(way.path) > LONG else 1.2
         style = {"color": scene.colour(robot), "linewidth": thick, "alpha": 0.9, "zorder": 6}
         label = robot if several else f"estimated path{gaps}"
-        out.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
-        out.append(Stroke(scene.bridges(robot), style | {"linestyle": ":"}))
-    out += (
-        (_true_paths(scene) if scene.picture.truth else [])
-        + _fix_strokes(scene)
-        + (_true_strokes(scene, crowded) if scene.picture.truth else [])
-        + _known_strokes(scene)
-        + _landmark_strokes(scene, crowded)
-        + _robot_strokes(scene)
-        + (_ray_strokes(scene) if scene.picture.sensors else [])
-    )
-    if len(scene.unseen):
-        cross = _marks("x", ALARM_COLOUR, 3 if crowded else 6, 7) | {"markeredgewidth": 0.8}
-        out.append(Stroke(scene.unseen, cross, "landmarks not seen again", cross | {"markersize": 6}))
-    if len(scene.repeats):
-        twice = {"color": ALARM_COLOUR, "linewidth": 0.9, "alpha": 0.8, "zorder": 5}
-        out.append(Stroke(scene.repeats, twice, "landmarks mapped twice", twice))
+        paths.append(Stroke(scene.line(robot), style, label, {"color": scene.colour(robot)}))
+        paths.append(Stroke(scene.bridges(robot), style | {"linestyle": ":"}))
+    triangle = _marks("^", KNOWN_COLOUR, 2.5 if len(scene.known) > CROWD else 6, 5) | {"markerfacecolor": "none"}
+    cross = _marks("x", ALARM_COLOUR, 3 if crowded else 6, 7) | {"markeredgewidth": 0.8}
+    twice = {"color": ALARM_COLOUR, "linewidth": 0.9, "alpha": 0.8, "zorder": 5}
+    others = [
+        *(_true_paths(scene) if scene.picture.truth else []),
+        *_fix_strokes(scene),
+        *(_true_strokes(scene, crowded) if scene.picture.truth else []),
+        Stroke(scene.known, triangle, "landmarks known exactly", triangle | {"markersize": 6}),
+        *_landmark_strokes(scene, crowded),
+        *_robot_strokes(scene),
+        *(_ray_strokes(scene) if scene.picture.sensors else []),
+        Stroke(scene.unseen, cross, "landmarks not seen again", cross | {"markersize": 6}),
+        Stroke(scene.repeats, twice, "landmarks mapped twice", twice),
+    ]
     for robot, way in scene.ways.items():
         dead = {"color": scene.colour(robot), "linewidth": 0.7, "alpha": 0.5, "linestyle": (0, (5, 3)), "zorder": 3}
         if np.isfinite(way.dead).any():
-            out.append(Stroke(break_path(way.dead, way.stretches), dead, "dead reckoning", dead))
-    return out
+            others.append(Stroke(break_path(way.dead, way.stretches), dead, "dead reckoning", dead))
+    return paths + [stroke for stroke in others if len(stroke.points)]
 
 
 def _fix_strokes(scene: Scene) -> list[Stroke]:
     small, cross = _marks(".", TRUTH_COLOUR, 1.8, 1), _marks("x", FIX_COLOUR, 3.5, 3) | {"markeredgewidth": 0.7}
     told = "position fixes (aligned, not used)"
     fixes = [Stroke(way.fixes, small, told, small | {"markersize": 6}) for way in scene.ways.values()]
-    fixes += [Stroke(way.used, cross, "fixes used", cross | {"markersize": 5}) for way in scene.ways.values()]
-    return [stroke for stroke in fixes if len(stroke.points)]
+    return fixes + [Stroke(way.used, cross, "fixes used", cross | {"markersize": 5}) for way in scene.ways.values()]
 
 
 def _true_style(scene: Scene) -> Style:
@@ -239,29 +237,20 @@ def _true_paths(scene: Scene) -> list[Stroke]:
 
 
 def _true_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
-    points, lines, style = list(scene.true_points().values()), scene.true_lines(), _true_style(scene)
-    said, out = f"true {scene.end}{scene.how}", []
-    if points:
-        colour, zorder = (scene.picture.colour("truth", INK), 6) if scene.d == 2 else (style["color"], 2)
-        plus = _marks("+", colour, 4 if crowded else 8, zorder) | {"markeredgewidth": 0.6 if crowded else 1.0}
-        out.append(Stroke(np.array(points), plus, f"true landmarks{scene.how}", _marks("+", colour, 7, 1)))
-    if lines:
-        out.append(
-            Stroke(
-                join_polylines(lines, scene.d), style, f"true {'walls' if scene.d == 2 else 'lines'}{scene.how}", style
-            )
-        )
-    out += [_robot_mark(scene, pose, style["color"], said, 5.5) for pose in scene.true_ends.values()]
+    style, points = _true_style(scene), np.array([*scene.true_points().values()]).reshape(-1, scene.d)
+    colour, zorder = (scene.picture.colour("truth", INK), 6) if scene.d == 2 else (style["color"], 2)
+    plus = _marks("+", colour, 4 if crowded else 8, zorder) | {"markeredgewidth": 0.6 if crowded else 1.0}
+    lines, what = join_polylines(scene.true_lines(), scene.d), "walls" if scene.d == 2 else "lines"
     tags = np.array([l for l in scene.true_landmarks.values() if len(l) == TAG]).reshape(-1, TAG)
-    return [*out, Stroke(join_polylines(squares(tags, scene.size)), style)] if len(tags) else out
-
-
-def _known_strokes(scene: Scene) -> list[Stroke]:
-    """Return the landmarks that were known exactly beforehand."""
-    if not len(scene.known):
-        return []
-    mark = _marks("^", KNOWN_COLOUR, 2.5 if len(scene.known) > CROWD else 6, 5) | {"markerfacecolor": "none"}
-    return [Stroke(scene.known, mark, "landmarks known exactly", mark | {"markersize": 6})]
+    return [
+        Stroke(points, plus, f"true landmarks{scene.how}", _marks("+", colour, 7, 1)),
+        Stroke(lines, style, f"true {what}{scene.how}", style),
+        *(
+            _robot_mark(scene, pose, style["color"], f"true {scene.end}{scene.how}", 5.5)
+            for pose in scene.true_ends.values()
+        ),
+        Stroke(join_polylines(squares(tags, scene.size)), style),
+    ]
 
 
 def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
@@ -277,14 +266,12 @@ def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
         said = label.format(scene.how_large(" of their ends" if name == "lines" else ""))
         out.append(Stroke(rings, {"color": colour, "zorder": 4, **thin}, said, {"color": colour, "marker": "."}))
         out.append(Stroke(shapes.means[mine], _marks(".", colour, 2 if crowded else 4, 5)))
-    if len(shapes.lines):
-        out.append(
-            Stroke(join_polylines(shapes.lines, scene.d), {"color": colours["lines"], "linewidth": 1.8, "zorder": 5})
-        )
-    if scene.d == 3:
-        tags = join_polylines(squares(shapes.tags, scene.size))
-        out.append(Stroke(tags, {"color": colours["landmarks"], "linewidth": 1.4, "zorder": 5}))
-    return out
+    lines, tags = join_polylines(shapes.lines, scene.d), join_polylines(squares(shapes.tags, scene.size))
+    return [
+        *out,
+        Stroke(lines, {"color": colours["lines"], "linewidth": 1.8, "zorder": 5}),
+        Stroke(tags, {"color": colours["landmarks"], "linewidth": 1.4, "zorder": 5}),
+    ]
 
 
 def _robot_strokes(scene: Scene) -> list[Stroke]:

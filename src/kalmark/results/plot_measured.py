@@ -1,26 +1,26 @@
 """The picture of one scan by a sensor that is no camera, in its measurement space: ``sensor_<robot>_<sensor>.png``.
 
 Two of its numbers are drawn: bearing and range, or two coordinates, those of a sensor of its own robot as in the map.
-Crosses are the measurements, ellipses of Z around
-e are what the filter expected, of landmarks in view that were not measured, too.
+Crosses are the measurements, ellipses of Z around e are what the filter expected, of landmarks in view that were not
+measured, too.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from kalmark.arrays import Array, Flags
+from kalmark.arrays import Array
 from kalmark.geometry.gaussian import ellipses
 from kalmark.picture_options import Picture
-from kalmark.results.history import History, Measuring
+from kalmark.results.history import Camera, History, Measuring
 from kalmark.results.labels import name_points
-from kalmark.results.scene import IN_VIEW, INK, Style
+from kalmark.results.scene import IN_VIEW, INK
 
 ACROSS = ("bearing_rad", "azimuth_rad", "y_m")  # columns to be drawn from right to left, the first that there is,
 AHEAD = ("range_m", "x_m")  # and upwards
@@ -69,18 +69,25 @@ def draw_measured(history: History, sensor: Measuring, step: int, options: Pictu
     figure = Figure(figsize=(9.5, 7.0), layout="constrained", facecolor="white")
     axes = figure.subplots()
     y, e, Z = history.y[rows][:, columns] * scale, *_expected(history.e[rows], history.Z[rows], columns, scale)
-    for k in np.flatnonzero(
-        scale == DEGREES
-    ):  # an expectation is drawn beside its measurement, across 180 degrees, too
+    for k in np.flatnonzero(scale == DEGREES):  # across 180 degrees, too, an expectation is beside its measurement
         y[:, k] = wrap_deg(y[:, k])
         e[:, k] = np.where(np.isfinite(y[:, k]), y[:, k] + wrap_deg(e[:, k] - y[:, k]), e[:, k])
     used = np.isin(history.outcome[rows], ("associated", "new"))
-    axes.plot(*y.T, "+", color=mark, ms=9, mew=1.4, zorder=4)
-    _draw(axes, e[used], Z[used], used_colour, "-")
-    _draw(axes, e[~used], Z[~used], unused, "--")
     missed = np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == sensor.sensor))
     e_m, Z_m = _expected(history.unmeasured_e[missed], history.unmeasured_Z[missed], columns, scale)
-    _draw(axes, e_m, Z_m, unmeasured, ":")
+    axes.plot(*y.T, "+", color=mark, ms=9, mew=1.4, zorder=4)
+    handles = [Line2D([], [], color=mark, ls="", marker="+", mew=1.4, label="measured")]
+    groups = (
+        ("used", e[used], Z[used], used_colour, "-"),
+        ("not used", e[~used], Z[~used], unused, "--"),
+        (IN_VIEW, e_m, Z_m, unmeasured, ":"),
+    )
+    for what, means, covariances, colour, style in groups:
+        axes.plot(*means.T, ".", color=colour, ms=3, zorder=5)
+        for contour in ellipses(means, covariances, 3.0, 60):
+            axes.plot(*contour.T, style, color=colour, lw=1.2, zorder=5)
+        if np.isfinite(means).all(axis=1).any():
+            handles.append(Line2D([], [], color=colour, ls=style, label=f"expected, $3\\sigma$, {what}"))
     names = [*history.landmark[rows].tolist(), *history.unmeasured_landmark[missed].tolist()]
     name_points(axes, np.vstack([y, e_m]), names, fontsize=8, color=INK)
     axes.set_xlabel(found[0].label)
@@ -89,13 +96,21 @@ def draw_measured(history: History, sensor: Measuring, step: int, options: Pictu
         axes.invert_xaxis()  # what is on the left has positive bearings
     axes.grid(color="#eceef1")
     axes.margins(0.08)
-    outcomes = Counter(history.outcome[rows].tolist()) | (Counter({IN_VIEW: len(missed)}) if len(missed) else Counter())
-    said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
-    title = f"{sensor.robot} · {sensor.sensor} · t = {history.t_s[step]:.3f} s · {said}"
-    figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
-    handles = _legend(used, e, len(missed), (mark, used_colour, unused, unmeasured))
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    title = scan_title(sensor, history.t_s[step], [*history.outcome[rows].tolist(), *[IN_VIEW] * len(missed)])
+    add_title_and_legend(figure, title, handles)
     return figure
+
+
+def scan_title(sensor: Camera | Measuring, t_s: float, outcomes: Iterable[str]) -> str:
+    """Return the title of a sensor's scan: when it was, and how many observations became what."""
+    said = ", ".join(f"{number} {outcome}" for outcome, number in Counter(outcomes).items())
+    return f"{sensor.robot} · {sensor.sensor} · t = {t_s:.3f} s · {said}"
+
+
+def add_title_and_legend(figure: Figure, title: str, handles: list[Line2D]) -> None:
+    """Write the title above a figure of a scan, and its legend below."""
+    figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
 
 
 def wrap_deg(angle: Array) -> Array:
@@ -106,23 +121,3 @@ def wrap_deg(angle: Array) -> Array:
 def _expected(e: Array, Z: Array, columns: list[int], scale: Array) -> tuple[Array, Array]:
     """Return e (K, 2) and Z (K, 2, 2) of two columns in the units of the axes."""
     return e[:, columns] * scale, Z[:, columns][:, :, columns] * np.outer(scale, scale)
-
-
-def _draw(axes: Axes, e: Array, Z: Array, colour: str, style: str) -> None:
-    axes.plot(*e.T, ".", color=colour, ms=3, zorder=5)
-    for contour in ellipses(e, Z, 3.0, 60):
-        axes.plot(*contour.T, style, color=colour, lw=1.2, zorder=5)
-
-
-def _legend(used: Flags, e: Array, missed: int, colours: tuple[str, str, str, str]) -> list[Line2D]:
-    mark, used_colour, unused, unmeasured = colours
-    expected, line = np.isfinite(e).all(axis=1), "expected, $3\\sigma$"
-    cross: Style = {"ls": "", "marker": "+", "mew": 1.4}
-    out = [Line2D([], [], color=mark, **cross, label="measured")]
-    if (expected & used).any():
-        out.append(Line2D([], [], color=used_colour, label=f"{line}, used"))
-    if (expected & ~used).any():
-        out.append(Line2D([], [], color=unused, ls="--", label=f"{line}, not used"))
-    if missed:
-        out.append(Line2D([], [], color=unmeasured, ls=":", label=f"{line}, {IN_VIEW}"))
-    return out

@@ -6,7 +6,6 @@ on what the filter expected it to see.
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from kalmark.results.explain import Explanation, Fate
 from kalmark.results.figure_texts import figure as figure_of
 from kalmark.results.history import Camera, Measuring
 from kalmark.results.labels import name_points
-from kalmark.results.plot_measured import draw_measured, sensors_with_picture
+from kalmark.results.plot_measured import add_title_and_legend, draw_measured, scan_title, sensors_with_picture
 from kalmark.results.recording import Recording
 from kalmark.results.scene import (
     INK,
@@ -44,9 +43,8 @@ PATH = 60  # steps of the path before the scan
 LEAST_M = 1.0
 ON_IMAGE = "#ffd400"  # of what was measured, over a picture
 MOST_NAMES = 30  # of landmarks, over a picture
-PAPER = 490.0  # width of the axes in points, about
-MARK = 6.0  # half a cross or a square, in points
-ON_LINE: Style = {"bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
+BESIDE = 6.0  # points of paper between the middle of a mark and its name
+ALONG = 0.5  # of the line from an observation to a landmark, where their d2 is
 MEASURED, SEGMENT, NAME = "#7d838d", "#3a68c8", "#1e4d2b"
 
 
@@ -70,88 +68,39 @@ def draw_scan(run: Recording, told: Explanation) -> Figure:
     means = kept.means[inside, :2]
     axes.plot(*means.T, ".", color=FAINT, ms=4, zorder=1)
     axes.plot(*join_polylines(contours(means, kept.shape[inside, :2, :2])[:, 0], 2).T, color=FAINT, lw=0.8)
-    _observations(axes, told, low, high)
+    _observations(axes, told)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.grid(color="#eceef1")
-    lines = [*told.lines()]
-    figure.suptitle(lines[0], x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
-    axes.set_title("\n".join(lines[1:3] if told.gates else lines[1:2]), loc="left", fontsize=9, color=INK)
-    figure.legend(handles=_legend(told), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    title, *lines = told.lines()
+    axes.set_title("\n".join(lines[: 2 if told.gates else 1]), loc="left", fontsize=9, color=INK)
+    add_title_and_legend(figure, title, _legend(told))
     return figure
 
 
-def _observations(axes: Axes, told: Explanation, low: Array, high: Array) -> None:
-    """Draw the marks of observations and landmarks, and the lines between; then their texts, each where it has room."""
+def _observations(axes: Axes, told: Explanation) -> None:
+    """Draw the marks of observations and landmarks, the lines between, and their texts: numbers, names and d2."""
     fates = [fate for fate in told.fates if np.isfinite(fate.seen_at[:2]).all()]
     squares = {str(other.landmark): other.place[:2] for fate in fates for other in fate.near}
-    labels = _Labels(axes, low, high, [*squares.values(), *(fate.seen_at[:2] for fate in fates)])
-    for place in squares.values():
-        axes.plot(*place, "s", color=INK, mfc="none", ms=8, zorder=4)
     for fate in fates:
         colour, at = OUTCOME_COLOURS.get(fate.outcome, INK), fate.seen_at[:2]
         axes.plot(*at, "x", color=colour, ms=9, mew=2, zorder=5)
-        labels.beside(at, _label(fate), fontsize=9, color=colour)
+        name_points(axes, [at], [_label(fate)], BESIDE, fontsize=9, color=colour, zorder=6)
+    for name, place in squares.items():
+        axes.plot(*place, "s", color=INK, mfc="none", ms=8, zorder=4)
+        name_points(axes, [place], [name], BESIDE, fontsize=8, color=INK, zorder=6)
+    for fate in fates:
+        colour, at = OUTCOME_COLOURS.get(fate.outcome, INK), fate.seen_at[:2]
         for other in fate.near:
             chosen = other.landmark == fate.landmark
             style: Style = {"ls": "-", "lw": 2} if chosen else {"ls": ":", "lw": 1}
             axes.plot(*zip(at, other.place[:2], strict=True), color=colour, **style)
-    for name, place in squares.items():
-        labels.beside(place, name, fontsize=8, color=INK)
-    for fate in fates:
-        for other in fate.near:
-            if other.landmark != fate.landmark:
-                style = {"fontsize": 8, "color": OUTCOME_COLOURS.get(fate.outcome, INK), **ON_LINE}
-                labels.along(fate.seen_at[:2], other.place[:2], figure_of(other.d2), **style)
-
-
-class _Labels:
-    """Texts in the axes from `low` to `high` (2,), each at that of several places where it covers the least.
-
-    Boxes are in points of the paper, left, bottom, right, top; those of the marks (2,) are taken from the start.
-    """
-
-    def __init__(self, axes: Axes, low: Array, high: Array, marks: list[Array]) -> None:
-        self.axes, self.low, self.scale = axes, low, PAPER / float(high[0] - low[0])
-        centres = np.array([self.paper(mark) for mark in marks]).reshape(-1, 2)
-        self.taken = np.hstack([centres - MARK, centres + MARK])
-
-    def paper(self, at: Array) -> Array:
-        """Return the place on paper of a place (2,) of the map."""
-        out: Array = (at - self.low) * self.scale
-        return out
-
-    def beside(self, at: Array, text: str, **style: Any) -> None:
-        """Put a text at a side of a mark, or at a corner."""
-        sides = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]], dtype=np.float64)
-        off = np.where(sides.all(axis=1, keepdims=True), [3.0, MARK], MARK + 2.0) + _half(text, style["fontsize"])
-        self._put(self.paper(at) + sides * off, text, style)
-
-    def along(self, one: Array, other: Array, text: str, **style: Any) -> None:
-        """Put a text on the line from one place to another, nearer to the first, or beside the line."""
-        begin, way = self.paper(one), self.paper(other) - self.paper(one)
-        across = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-9)
-        off = float(np.abs(across) @ _half(text, style["fontsize"])) + 2.0
-        parts = np.array([0.35, 0.5, 0.25, 0.65, 0.8])[:, None]
-        places = [begin + parts * way + side * off * across for side in (0.0, 1.0, -1.0)]
-        self._put(np.concatenate(places), text, style)
-
-    def _put(self, centres: Array, text: str, style: Style) -> None:
-        half = _half(text, style["fontsize"])
-        boxes = np.hstack([centres - half, centres + half])[:, None]
-        sides = np.minimum(boxes[..., 2:], self.taken[:, 2:]) - np.maximum(boxes[..., :2], self.taken[:, :2])
-        best = int(np.argmin(np.prod(np.maximum(sides, 0.0), axis=2).sum(axis=1)))
-        self.taken = np.vstack([self.taken, boxes[best]])
-        at = self.low + centres[best] / self.scale
-        self.axes.text(at[0], at[1], text, ha="center", va="center", clip_on=True, zorder=6, **style)
-
-
-def _half(text: str, size: float) -> Array:
-    """Return half the width and height (2,) of a text, in points, about."""
-    return np.array([0.31 * size * len(text), 0.55 * size])
+            if not chosen:
+                on_line = at + ALONG * (other.place[:2] - at)
+                name_points(axes, [on_line], [figure_of(other.d2)], 1.0, fontsize=8, color=colour, zorder=6)
 
 
 def _label(fate: Fate) -> str:
@@ -214,11 +163,8 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     pictures, options = Pictures(run), picture_of(run)
     for axes, image in zip(grid, seen, strict=True):
         draw_image(axes, image, camera.size, options, pictures.at(camera, int(steps[-1]), image.side))
-    outcomes = Counter(s.outcome for s in seen[0].sightings)
-    said = ", ".join(f"{number} {outcome}" for outcome, number in outcomes.items())
-    title = f"{robot} · {sensor} · t = {history.t_s[steps[-1]]:.3f} s · {said}"
-    figure.suptitle(title, x=0.02, ha="left", fontsize=12, fontweight="bold", color=INK)
-    figure.legend(handles=legend(seen, options), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    title = scan_title(camera, history.t_s[steps[-1]], [s.outcome for s in seen[0].sightings])
+    add_title_and_legend(figure, title, legend(seen, options))
     return figure
 
 

@@ -5,7 +5,6 @@ Those are TUM trajectories, ``associations.csv``, ``changes.csv`` and ``config.y
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import io
 import json
@@ -14,7 +13,7 @@ import shutil
 import zipfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -27,7 +26,7 @@ from ruamel.yaml import YAML
 from kalmark.declare import load_plugin
 from kalmark.errors import RunError
 from kalmark.events import fixed_seconds, list_names, short_text
-from kalmark.files import hold_lock, read_arrays, refuse_aliases, replace_file, write
+from kalmark.files import csv_text, hold_lock, read_arrays, refuse_aliases, replace_file, write
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of
 from kalmark.results.figure_texts import Figures
@@ -67,7 +66,7 @@ def associations_csv(history: History) -> str:
     columns: list[Sequence[Any]] = [[times[s] for s in steps], [robots[s] for s in steps], *seen, landmarks, d2]
     columns.append(history.reason.tolist())
     if not len(history.share_row):
-        return _csv(ASSOCIATIONS, zip(*columns, strict=True))
+        return csv_text(ASSOCIATIONS, zip(*columns, strict=True))
     shares = defaultdict(list)
     soft = (history.share_row, history.share_landmark, history.share_weight)
     for row, *share in zip(*(column.tolist() for column in soft), strict=True):
@@ -76,22 +75,14 @@ def associations_csv(history: History) -> str:
     for k, (*head, landmark, number, reason) in enumerate(zip(*columns, strict=True)):
         for name, weight in shares.get(k, [(landmark, 1.0)]):
             rows.append([*head, name, number if name == landmark else "", reason, weight])
-    return _csv((*ASSOCIATIONS, "weight"), rows)
+    return csv_text((*ASSOCIATIONS, "weight"), rows)
 
 
 def changes_csv(history: History) -> str:
     """Return one row for each landmark that was removed or merged with another: after which scan, and why."""
-    rows = [
-        [fixed_seconds(history.t_ns[c.step]), history.robot[c.step], c.landmark, c.what, c.into, c.reason]
-        for c in history.changes
-    ]
-    return _csv(CHANGES, rows)
-
-
-def _csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([header, *rows])
-    return out.getvalue()
+    return csv_text(
+        CHANGES, ([fixed_seconds(history.t_ns[c.step]), history.robot[c.step], *c[1:]] for c in history.changes)
+    )
 
 
 def _savez(path: Path, arrays: Mapping[str, Any]) -> None:

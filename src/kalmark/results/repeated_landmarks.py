@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kalmark.management.repeated_places import IN_A_REPEAT, find_repeats
 from kalmark.results.figure_texts import Figures, count, figure
-from kalmark.results.history import History, Repeated
+from kalmark.results.history import History, Repeated, grouped
 from kalmark.results.recording import Recording
 
 if TYPE_CHECKING:
@@ -33,21 +34,17 @@ def repeat_figures(run: Recording) -> list[Figures]:
 
     `start_s` is when three landmarks of the newer part had been observed, in seconds of the log.
     """
-    rows, out = run.history.repeats, []
-    for number in dict.fromkeys(row.number for row in rows):
-        mine = [row for row in rows if row.number == number]
-        first = mine[0]
-        out.append(
-            {
-                "landmarks": [[row.landmark, row.other] for row in mine],
-                "shift_m": first.shift.tolist(),
-                "turn_rad": first.turn_rad,
-                "score": first.score,
-                "p": first.p,
-                "start_s": _start_s(run.history, [row.other for row in mine]),
-            }
-        )
-    return out
+    return [
+        {
+            "landmarks": [[row.landmark, row.other] for row in mine],
+            "shift_m": mine[0].shift.tolist(),
+            "turn_rad": mine[0].turn_rad,
+            "score": mine[0].score,
+            "p": mine[0].p,
+            "start_s": _start_s(run.history, [row.other for row in mine]),
+        }
+        for mine in grouped(run.history.repeats, attrgetter("number")).values()
+    ]
 
 
 def repeat_notes(history: History) -> Iterator[str]:

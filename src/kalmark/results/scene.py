@@ -177,9 +177,9 @@ class Scene:
         return "" if self.picture.ellipses == "off" else f", {self.picture.sigmas:g}σ{of} {self.of_what}"
 
     def rings(self, means: Array, covariances: Array) -> Array:
-        """Return the contours of Gaussians as one polyline (N, d), NaN between them; none if they are not drawn."""
+        """Return the contours of Gaussians as one polyline (N, d), NaN between them; NaN alone if they are not drawn."""
         if self.picture.ellipses == "off":
-            return np.empty((0, self.d))
+            return np.full((1, self.d), np.nan)
         return join_polylines(np.concatenate(contours(means, covariances, self.picture.sigmas)), self.d)
 
     @property
@@ -366,13 +366,6 @@ def drawn_box(
     The ends (R, d) have the covariances P (R, d, d).  Contours reach out of it where they are huge.  Limits of the
     picture replace what they name.
     """
-    low, high = _box(path, ends, P, drawn, more)
-    given = np.reshape(picture.limits_m or (), (-1, 2))[: len(low)]
-    low[: len(given)], high[: len(given)] = given.T
-    return low, high
-
-
-def _box(path: Array, ends: Array, P: Array, drawn: Shapes, more: list[Array]) -> tuple[Array, Array]:
     d = path.shape[1]
     means, covariances = drawn.means, drawn.covariances
     known = is_finite(means, covariances)
@@ -382,17 +375,20 @@ def _box(path: Array, ends: Array, P: Array, drawn: Shapes, more: list[Array]) -
     clear = known & ((drawn.group == EUCLIDEANS) | (sigma.max(axis=1, initial=0.0) < CLEAR * distance))
     points = np.concatenate([path, means[clear], *more])
     points = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        return -np.ones(d), np.ones(d)
-    limit = max(REACH * float(np.ptp(points, axis=0).max()), REACH_M)
-    centres = np.concatenate([means[clear], ends])
-    reach = np.fmin(3 * np.concatenate([sigma[clear], sigmas(P)]), limit)
-    points = np.concatenate([points, centres - reach, centres + reach])
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, half = (low + high) / 2, (high - low) / 2
-    half += max(2 * PAD * float(half.max()), PAD_M)
-    half[:2] = np.maximum(half[:2], NARROW * half.max())
-    return middle - half, middle + half
+    low, high = -np.ones(d), np.ones(d)
+    if len(points):
+        limit = max(REACH * float(np.ptp(points, axis=0).max()), REACH_M)
+        centres = np.concatenate([means[clear], ends])
+        reach = np.fmin(3 * np.concatenate([sigma[clear], sigmas(P)]), limit)
+        points = np.concatenate([points, centres - reach, centres + reach])
+        low, high = points.min(axis=0), points.max(axis=0)
+        middle, half = (low + high) / 2, (high - low) / 2
+        half += max(2 * PAD * float(half.max()), PAD_M)
+        half[:2] = np.maximum(half[:2], NARROW * half.max())
+        low, high = middle - half, middle + half
+    given = np.reshape(picture.limits_m or (), (-1, 2))[:d]
+    low[: len(given)], high[: len(given)] = given.T
+    return low, high
 
 
 class Sighting(NamedTuple):
@@ -424,14 +420,11 @@ def images(history: History, camera: Camera, step: int) -> list[Image]:
     found = [Image(SIDES[side], []) for side in points]
     for row in np.flatnonzero(history.step == step):
         name, outcome = str(history.landmark[row]) or str(history.id[row]), str(history.outcome[row])
-        of = history.y[row], history.e[row], history.z[row], history.Z[row]
-        _add_sighting(found, points, (name, outcome, str(history.kind[row]) in EUCLIDEAN), of)
+        named = name, outcome, str(history.kind[row]) in EUCLIDEAN
+        _add_sighting(found, points, named, history.e[row], history.Z[row], history.y[row], history.z[row])
     for row in np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == camera.sensor)):
-        e, Z, name = history.unmeasured_e[row], history.unmeasured_Z[row], str(history.unmeasured_landmark[row])
-        for image, at in zip(found, points.values(), strict=True):
-            Z_at = Z[np.ix_(at[0], at[0])] if len(at) == 1 else np.full((2, 2), np.nan)
-            euclidean = str(history.unmeasured_kind[row]) in EUCLIDEAN
-            image.sightings.append(Sighting(name, IN_VIEW, euclidean, np.empty((0, 2)), e[at], Z_at))
+        named = str(history.unmeasured_landmark[row]), IN_VIEW, str(history.unmeasured_kind[row]) in EUCLIDEAN
+        _add_sighting(found, points, named, history.unmeasured_e[row], history.unmeasured_Z[row])
     return found
 
 
@@ -445,21 +438,21 @@ def images_of_report(camera: Camera, report: Report, kinds: Sequence[str]) -> li
     points = _points(camera)
     found = [Image(SIDES[side], []) for side in points]
     for o, kind in zip(report.observations, kinds, strict=True):
-        name = "" if o.landmark is None and o.id is None else str(o.id if o.landmark is None else o.landmark)
-        of = report.y[o.index], report.e[o.index], report.z[o.index], report.Z[o.index]
-        _add_sighting(found, points, (name, o.outcome, kind in EUCLIDEAN), of)
+        name, k = next((str(each) for each in (o.landmark, o.id) if each is not None), ""), o.index
+        named = name, o.outcome, kind in EUCLIDEAN
+        _add_sighting(found, points, named, report.e[k], report.Z[k], report.y[k], report.z[k])
     return found
 
 
 def _add_sighting(
-    found: list[Image], points: Mapping[str, Ints], named: tuple[str, str, bool], of: tuple[Array, Array, Array, Array]
-) -> None:
-    """Add an observation to the images that it is in: its name, outcome and whether it is Euclidean; y, e, z and Z."""
-    y, e, z, Z = of
-    whole = np.isfinite(z).sum() == np.isfinite(y).sum()
+    found: list[Image], points: Mapping[str, Ints], named: tuple[str, str, bool], e: Array, Z: Array,
+    y: Array | None = None, z: Array | None = None,
+) -> None:  # fmt: skip
+    """Add to its images an observation, or what was not measured: its name, outcome and whether it is Euclidean."""
+    whole = y is None or z is None or np.isfinite(z).sum() == np.isfinite(y).sum()
     for image, at in zip(found, points.values(), strict=True):
         Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
-        image.sightings.append(Sighting(*named, y[at], e[at], Z_at))
+        image.sightings.append(Sighting(*named, np.empty((0, 2)) if y is None else y[at], e[at], Z_at))
 
 
 def colour_of(sighting: Sighting, picture: Picture) -> tuple[str, str]:
@@ -470,8 +463,7 @@ def colour_of(sighting: Sighting, picture: Picture) -> tuple[str, str]:
 
 def steps_of(history: History, camera: Camera | Measuring) -> Ints:
     """Return the steps at which a sensor observed something."""
-    mine = (history.sensor == camera.sensor) & (history.robot[history.step] == camera.robot)
-    return np.unique(history.step[mine])
+    return np.unique(history.step[history.made_by(camera.robot, camera.sensor)])
 
 
 def _points(camera: Camera) -> dict[str, Ints]:

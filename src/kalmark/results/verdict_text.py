@@ -45,14 +45,9 @@ def _first(verdict: Summary) -> str:
     why = ": the log does not check it" if verdict["map"] == UNCHECKED else harmful * (verdict["map"] != OK)
     what = "path" if str(verdict["checked"]).endswith((NO_MAP, NO_LANDMARKS)) else "map"
     because = harmful * (verdict["map"] == OK)
-    paths = [f"the path of {of} is {status}{because * (status != UNCHECKED)}" for of, status in _worse(verdict)]
+    others = [each for each in verdict.get("robots", {}).items() if each[1] != verdict["map"]]
+    paths = [f"the path of {of} is {status}{because * (status != UNCHECKED)}" for of, status in others]
     return "; but ".join([f"the {what} is {verdict['map']}{why}{_trust(verdict)}", *[", ".join(paths)] * bool(paths)])
-
-
-def _worse(verdict: Summary) -> Iterator[tuple[str, str]]:
-    """Yield the robots whose path is worse than the map, and what it is."""
-    robots = verdict.get("robots", {})
-    return ((of, status) for of, status in robots.items() if status != verdict["map"])
 
 
 def _trust(verdict: Summary) -> str:

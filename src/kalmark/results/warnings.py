@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from difflib import get_close_matches
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -32,8 +33,8 @@ from kalmark.results.association_errors import LEAST, no_ids
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
 from kalmark.results.control_gaps import gap_warnings
 from kalmark.results.figure_texts import Figures, Summary, count, figure
-from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix
-from kalmark.results.measures import nis, place_sigma, truncated_variance
+from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix, grouped
+from kalmark.results.measures import associated_nis, nis, place_sigma, truncated_variance
 from kalmark.results.recording import Recording, Section
 from kalmark.results.repeated_landmarks import repeat_warnings
 from kalmark.results.restarts import restarts
@@ -99,9 +100,8 @@ def window_figures(history: History) -> Figures:
 
 def nis_windows(history: History) -> list[Window]:
     """Return the NIS per degree of freedom of windows of at least so many degrees, one after the other."""
-    used = history.outcome == "associated"
-    value, dof = nis(history.z[used], history.Z[used])
-    return _windows(history, history.step[used], np.nan_to_num(value), dof, DEGREES, WINDOW_SCANS)
+    value, dof, step = associated_nis(history)
+    return _windows(history, step, value, dof, DEGREES, WINDOW_SCANS)
 
 
 def left_out_windows(history: History) -> list[Window]:
@@ -117,7 +117,7 @@ def autocorrelations(history: History) -> list[Window]:
     """Return the correlation of successive whitened innovations of the same landmark, window by window."""
     rows = np.flatnonzero((history.outcome == "associated") & np.isfinite(history.z).any(axis=1))
     white = _whitened(history, rows)
-    robots = history.robot[history.step[rows]]
+    robots = history.observers[rows]
     order = np.lexsort((history.step[rows], history.landmark[rows], history.sensor[rows], robots))
     one, two = order[:-1], order[1:]
     same = history.step[rows[two]] - history.step[rows[one]] <= MOST_GAP_STEPS
@@ -288,10 +288,7 @@ def _diverged(_: Recording, summary: Summary) -> Iterator[str]:
 
 def placements(history: History) -> list[list[RelocatedRobot]]:
     """Return the times when robots were placed elsewhere, those of a sensor together."""
-    of = {(one.robot, one.sensor): list[RelocatedRobot]() for one in history.placed}
-    for one in history.placed:
-        of[one.robot, one.sensor].append(one)
-    return [*of.values()]
+    return [*grouped(history.placed, attrgetter("robot", "sensor")).values()]
 
 
 def words_of(placed: list[RelocatedRobot]) -> str:
@@ -307,7 +304,7 @@ def _observations(run: Recording, summary: Summary) -> Iterator[str]:
         yield "no observation was made: there is nothing to map"
     elif not summary["landmarks"] and history.scans and not history.localizes:
         yield "no landmark was mapped"
-    seen = list(zip(history.robot[history.step].tolist(), history.sensor.tolist(), strict=True))
+    seen = history.sensor_keys()
     bearing = {pair for pair in set(seen) if run.section(*pair).get("type") in BEARINGS}
     angles = history.y[[pair in bearing for pair in seen]][:, 1:]  # all but the first column are bearings
     turns = (np.abs(angles) > 2 * np.pi).any(axis=1)  # NaN, where a sensor has less numbers, is not
@@ -322,11 +319,11 @@ def left_out_by_attention(history: History) -> Flags:
 
 def _unused(run: Recording) -> Iterator[str]:
     """Yield warnings of sensors most of whose observations could not be used, and of none of a known landmark."""
-    history, robots = run.history, run.history.robot[run.history.step]
+    history = run.history
     by_design = left_out_by_attention(history) | (history.reason == AGAIN)
-    pairs = sorted(set(zip(robots.tolist(), history.sensor.tolist(), strict=True)))
+    pairs = sorted(set(history.sensor_keys()))
     for robot, sensor in pairs:
-        own = (robots == robot) & (history.sensor == sensor)
+        own = history.made_by(robot, sensor)
         of = f" of {sensor!r} of {robot!r}" if len(pairs) > 1 else ""
         mine = own & ~np.isin(history.outcome, ("associated", "new")) & ~by_design
         if 2 * int(mine.sum()) <= int(own.sum()):
@@ -346,9 +343,8 @@ def _unused(run: Recording) -> Iterator[str]:
 def _images(run: Recording, _: Summary) -> Iterator[str]:
     """Yield warnings of cameras whose measurements lie outside their images."""
     history = run.history
-    robots = history.robot[history.step]
     for camera in history.cameras:
-        mine = (robots == camera.robot) & (history.sensor == camera.sensor)
+        mine = history.made_by(camera.robot, camera.sensor)
         outside = np.zeros(int(mine.sum()), dtype=np.bool_)
         for k, name in enumerate(camera.columns):
             if name.endswith("_px"):
@@ -382,8 +378,7 @@ def _robots(run: Recording, summary: Summary) -> Iterator[str]:
 def _sensors(run: Recording, summary: Summary) -> Iterator[str]:
     """Yield the configured sensors that no observation was by."""
     robots: Section = run.config.get("robots") or {}
-    rows = zip(run.history.robot[run.history.step].tolist(), run.history.sensor.tolist(), strict=True)
-    seen = set(rows)
+    seen = set(run.history.sensor_keys())
     for key, given in robots.items() if seen and not run.stopped else ():
         mine = [name for name in run.log.robots if name == key or (key == "each" and name not in robots)]
         used = sorted({sensor for robot, sensor in seen if robot in mine})
@@ -426,12 +421,10 @@ def _some(names: set[str]) -> str:
     return ", ".join(first) + (", ..." if len(names) > len(first) else "")
 
 
-def _first_fixes(run: Recording, _: Summary) -> Iterator[str]:
-    fixes = run.history.fixes
+def _first_fixes(run: Recording, summary: Summary) -> Iterator[str]:
     starts = {start.robot: start for start in run.history.starts}
-    for name in dict.fromkeys(fix.robot for fix in fixes):
-        first = next(fix for fix in fixes if fix.robot == name)
-        if name in starts and _d2(first) > gate(FIRST_FIX, len(first.z)):
+    for name, (first, *_) in grouped(run.history.fixes, attrgetter("robot")).items():
+        if name in starts and first.d2 > gate(FIRST_FIX, len(first.z)):
             far, sigma = float(np.linalg.norm(first.z)), float(place_sigma(starts[name].covariance, len(first.z)))
             yield (
                 f"the first fix of {name} is {figure(far)} m from where its start puts it, "
@@ -450,11 +443,7 @@ def _fixes(run: Recording, summary: Summary) -> Iterator[str]:
 def fix_nis_per_dof(fixes: tuple[UsedFix, ...]) -> float:
     """Return the sum of the normalised innovations squared of the fixes used over their dimensions, NaN without any."""
     used = [fix for fix in fixes if fix.used]
-    return sum(_d2(fix) for fix in used) / sum(len(fix.z) for fix in used) if used else float("nan")
-
-
-def _d2(fix: UsedFix) -> float:
-    return float(fix.z @ np.linalg.solve(fix.Z, fix.z))
+    return sum(fix.d2 for fix in used) / sum(len(fix.z) for fix in used) if used else float("nan")
 
 
 def is_overconfident(figures: Summary) -> bool:
