@@ -214,8 +214,9 @@ class _Writer:
         self, robot: str, topics: Sequence[TopicSummary], flat: bool
     ) -> tuple[TopicSummary | tuple[str, str] | None, str]:
         """Return the topic, or the frames, of a robot's controls, and their type."""
-        odometries = [t for t in topics if t.offers.twist and t.offers.pose and not _is_true(t) and t.poses.frames]
-        odometries.sort(key=lambda t: (not t.poses.moves, any(word in t.name.lower() for word in LATER), t.name))
+        estimated = [t for t in topics if not _has_word(t, TRUE)]
+        odometries = [t for t in estimated if t.offers.twist and t.offers.pose and t.poses.frames]
+        odometries.sort(key=lambda t: (not t.poses.moves, _has_word(t, LATER), t.name))
         for topic in odometries[:1]:
             if topic.turns and not topic.poses.moves:
                 return topic, "unicycle" if flat else "velocity_3d"
@@ -228,7 +229,7 @@ class _Writer:
             return topic, "ackermann"
         for topic in sorted((t for t in topics if t.offers.twist), key=lambda t: ("cmd" in t.name, t.name)):
             return topic, "unicycle" if flat else "velocity_3d"
-        for topic in (t for t in topics if t.offers.pose and not _is_true(t) and not t.offers.noisy and _is_path(t)):
+        for topic in (t for t in estimated if t.offers.pose and not t.offers.noisy and _is_path(t)):
             return topic, "odometry_2d" if flat and topic.poses.flat else "odometry_3d"
         return None, ""
 
@@ -254,7 +255,7 @@ class _Writer:
     def place(self, topic: TopicSummary) -> Entry | None:
         """Return what a topic of positions is, None if it is none or not to be used."""
         if topic.offers.globe is not None and topic.origin is not None:
-            if _is_true(topic):
+            if _has_word(topic, TRUE):
                 return {"type": "truth"}, f"{topic_text(topic)}; {GUESS} by its name: its positions only score"
             entry: dict[str, Any] = {"type": "fix", "origin": [float(v) for v in topic.origin]}
             if topic.poses.cov is None:
@@ -263,9 +264,9 @@ class _Writer:
             return entry, f"{topic_text(topic)}; the origin is the first fix"
         if topic.offers.pose is None or not topic.poses.frames:
             return None
-        if _is_true(topic):
+        if _has_word(topic, TRUE):
             return {"type": "truth"}, f"{topic_text(topic)}; {GUESS} by its name"
-        if topic.offers.twist is None and topic.offers.noisy and not _is_wanted(topic):
+        if topic.offers.twist is None and topic.offers.noisy and not _has_word(topic, WANTED):
             if topic.poses.cov is None:
                 why = f"{topic_text(topic)}; {GUESS} positions in the map, and sigma_m, as they have no covariance"
                 return {"type": "fix", "sigma_m": POSE_M}, why
@@ -314,16 +315,12 @@ def _moves(topic: TopicSummary) -> bool:
     return topic.offers.twist is not None or topic.offers.drive is not None
 
 
-def _is_true(topic: TopicSummary) -> bool:
-    return any(word in topic.name.lower() for word in TRUE)
-
-
-def _is_wanted(topic: TopicSummary) -> bool:
-    return any(word in topic.name.lower() for word in WANTED)
+def _has_word(topic: TopicSummary, words: Sequence[str]) -> bool:
+    return any(word in topic.name.lower() for word in words)
 
 
 def _is_path(topic: TopicSummary) -> bool:
-    return topic.poses.moves and len(topic.poses.frames) >= LEAST_POSES and not _is_wanted(topic)
+    return topic.poses.moves and len(topic.poses.frames) >= LEAST_POSES and not _has_word(topic, WANTED)
 
 
 def _is_odometry(parent: str, child: str) -> bool:

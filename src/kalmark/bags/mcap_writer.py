@@ -46,11 +46,8 @@ class Types:
 
     def made(self, kind: str, fields: dict[str, Any]) -> Any:
         """Return a message of a type."""
-        given = {name: self._value(description, fields.get(name)) for name, description in self._fields(kind)}
-        return self.store.types[kind](**given)
-
-    def _fields(self, kind: str) -> list[tuple[str, Any]]:
-        return list(self.store.fielddefs[kind][1])
+        _, described = self.store.fielddefs[kind]
+        return self.store.types[kind](**{name: self._value(one, fields.get(name)) for name, one in described})
 
     def _value(self, description: Any, value: Any) -> Any:
         import numpy as np

@@ -56,6 +56,14 @@ class Seen:
         self.y.append(list(y))  # type: ignore[union-attr]
         self.ids.append(id_)
 
+    @classmethod
+    def of(cls, columns: tuple[str, ...], rows: Iterable[tuple[Iterable[float], Any]]) -> Seen:
+        """Return the observations of these numbers and ids."""
+        seen = cls(columns)
+        for y, id_ in rows:
+            seen.add(y, id_)
+        return seen
+
     def without(self, ignored: Sequence[bool]) -> Seen:
         """Return this without the observations that `ignore` of the topic names."""
         if not any(ignored):
@@ -328,19 +336,14 @@ def detection_id(each: Any, scan: Scans) -> Any:
 
 def boxes(m: Any, scan: Scans) -> Seen:
     """Return the centres (px) of a vision_msgs/Detection2DArray."""
-    seen = Seen(("u_px", "v_px"))
-    for each in m.detections:
-        centre = getattr(each.bbox.center, "position", each.bbox.center)
-        seen.add([float(centre.x), float(centre.y)], detection_id(each, scan))
-    return seen
+    centres = ((getattr(each.bbox.center, "position", each.bbox.center), each) for each in m.detections)
+    rows = (([float(centre.x), float(centre.y)], detection_id(each, scan)) for centre, each in centres)
+    return Seen.of(("u_px", "v_px"), rows)
 
 
 def boxes_of_space(m: Any, scan: Scans) -> Seen:
     """Return the poses of the boxes of a vision_msgs/Detection3DArray."""
-    seen = Seen(POSE3)
-    for each in m.detections:
-        seen.add(pose_frame(each.bbox.center).tolist(), detection_id(each, scan))
-    return seen
+    return Seen.of(POSE3, ((pose_frame(each.bbox.center).tolist(), detection_id(each, scan)) for each in m.detections))
 
 
 def markers(listed: Iterable[Any], scan: Scans) -> Seen:
@@ -388,10 +391,8 @@ def tag_poses(m: Any, scan: Scans) -> Seen:
 
 def listed_poses(m: Any, scan: Scans) -> Seen:
     """Return the poses of a ros2_aruco_interfaces/ArucoMarkers, whose ids are a list of their own."""
-    seen = Seen(POSE3)
-    for id_, pose in zip(m.marker_ids, m.poses, strict=True):
-        seen.add(pose_frame(pose).tolist(), int(id_))
-    return seen
+    rows = zip(m.marker_ids, m.poses, strict=True)
+    return Seen.of(POSE3, ((pose_frame(pose).tolist(), int(id_)) for id_, pose in rows))
 
 
 # ------------------------------------------------------------------ the table

@@ -78,10 +78,11 @@ def paths(run: Run, robot: str) -> Iterator[Outgoing]:
 
 def mount_frames(run: Run, t_ns: int) -> list[Outgoing]:
     """Return the frames of the sensors as configured, in those of their robots."""
-    robots, frames = run.config.get("robots") or {}, []
-    for robot in run.history.robots:
-        for sensor, section in ((robots.get(robot) or robots.get("each") or {}).get("sensors") or {}).items():
-            frames.append(view.transform_fields(t_ns, robot, f"{robot}/{sensor}", pose_of(section.get("mount") or {})))
+    frames = [
+        view.transform_fields(t_ns, robot, f"{robot}/{sensor}", pose_of(section.get("mount") or {}))
+        for robot in run.history.robots
+        for sensor, section in run.sections(robot).items()
+    ]
     return [tf("/tf_static", t_ns, frames)] if frames else []
 
 

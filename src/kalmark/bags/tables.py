@@ -61,9 +61,9 @@ def messages_of_log(log: Log) -> Iterator[Outgoing]:
     for id_, place in log.landmarks.items():
         yield record_message(LANDMARKS, begin, "", values=place, ids=[id_text(id_)])
     streams = [
-        map(message_function(log), log.events),
-        *map(pose_records, log.truth.items()),
-        *map(fix_records, log.gps.items()),
+        (record_of_event(log, event) for event in log.events),
+        *(pose_records(robot, path) for robot, path in log.truth.items()),
+        *(fix_records(robot, track) for robot, track in log.gps.items()),
     ]
     yield from merge(*streams, key=lambda message: message.t_ns)
 
@@ -88,37 +88,30 @@ def record_message(
     return Outgoing(topic, RECORD, t_ns, fields)
 
 
-def message_function(log: Log) -> Any:
-    """Return the function that makes an event a message."""
-
-    def made(event: Event) -> Outgoing:
-        if isinstance(event, Control):
-            columns = log.control_columns.get(event.robot, ())
-            return record_message(CONTROLS, event.t_ns, event.robot, event.u, columns=columns, cov=event.cov)
-        if isinstance(event, Fix):
-            return record_message(
-                FIXES, event.t_ns, event.robot, event.y, columns=POSITION[: len(event.y)], cov=event.cov
-            )
-        if isinstance(event, Raw):
-            raise LogError(f"{label_of_event(event)}: raw data, expected controls, scans and fixes")
-        columns = log.sensor_columns.get((event.robot, event.sensor), ())
-        ids = ["" if id_ is None else id_text(id_) for id_ in event.ids or ()]
-        return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov)
-
-    return made
+def record_of_event(log: Log, event: Event) -> Outgoing:
+    """Return an event as a message.  Raises LogError for raw data."""
+    if isinstance(event, Control):
+        columns = log.control_columns.get(event.robot, ())
+        return record_message(CONTROLS, event.t_ns, event.robot, event.u, columns=columns, cov=event.cov)
+    if isinstance(event, Fix):
+        columns = POSITION[: len(event.y)]
+        return record_message(FIXES, event.t_ns, event.robot, event.y, columns=columns, cov=event.cov)
+    if isinstance(event, Raw):
+        raise LogError(f"{label_of_event(event)}: raw data, expected controls, scans and fixes")
+    columns = log.sensor_columns.get((event.robot, event.sensor), ())
+    ids = ["" if id_ is None else id_text(id_) for id_ in event.ids or ()]
+    return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov)
 
 
-def pose_records(item: tuple[str, Trajectory]) -> Iterator[Outgoing]:
+def pose_records(robot: str, path: Trajectory) -> Iterator[Outgoing]:
     """Yield the true poses of one robot."""
-    robot, path = item
     columns = POSE2 if path.poses.shape[1] == 3 else POSE3
     for t_ns, pose in zip(path.t_ns.tolist(), path.poses, strict=True):
         yield record_message(TRUTH, t_ns, robot, pose, columns=columns)
 
 
-def fix_records(item: tuple[str, PositionTrack]) -> Iterator[Outgoing]:
+def fix_records(robot: str, track: PositionTrack) -> Iterator[Outgoing]:
     """Yield the positions of one robot that only score."""
-    robot, track = item
     for t_ns, xy in zip(track.t_ns.tolist(), track.xy, strict=True):
         yield record_message(GPS, t_ns, robot, [*xy, *track.antenna], columns=GPS_COLUMNS)
 
@@ -152,7 +145,7 @@ def read(bag: Bag, request: Request) -> Log:
             name=about["name"], format="bag", path=bag.path, robots=tuple(about["robots"]),
             events=sorted(events, key=sort_key), skipped=request.skipped, landmarks=landmarks,
             truth={robot: Trajectory.of(p) for robot, p in truth.items()},
-            gps={robot: _track(rows) for robot, rows in gps.items()},
+            gps={robot: PositionTrack.of(rows) for robot, rows in gps.items()},
             control_columns={robot: tuple(columns) for robot, columns in about["control_columns"].items()},
             sensor_columns={(robot, sensor): tuple(columns) for robot, sensor, columns in about["sensor_columns"]},
             describes=about["describes"],
@@ -175,8 +168,3 @@ def event_of_message(received: Received) -> Event:
         cov = cov.reshape(size, size) if len(cov) == size * size and len(y) > 1 else cov.reshape(len(y), size, size)
     ids = [landmark_id(text) if text else None for text in m.ids] if len(m.ids) else None
     return Scan(t_ns=int(m.t_ns), robot=m.robot, sensor=m.sensor, y=y, ids=ids, cov=cov)
-
-
-def _track(rows: list[tuple[int, Array]]) -> PositionTrack:
-    values = np.array([row for _, row in rows])
-    return PositionTrack(np.array([t for t, _ in rows]), values[:, :2], values[0, 2:])

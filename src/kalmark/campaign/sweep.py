@@ -7,7 +7,6 @@ import html
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from kalmark.campaign.sweep_cells import Cell, value_as_yaml
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.figure_texts import Figures
-from kalmark.results.report import figure_text
+from kalmark.results.report import figure_text, html_table, read_page, spans
 from kalmark.results.scene import COLOURS
 
 _PANELS = (
@@ -206,14 +205,11 @@ class Sweep:
         lost = sum(score.diverged for c in self.campaigns for scores in c.scores.values() for score in scores)
         told = [f"seed {first.seed}", f"{len(first.t_s)} steps", f"{lost} diverged"]
         told += [f"first {first.skip} steps left out"] if first.skip else []
-        cells = [[c if isinstance(c, str) else figure_text(c) for c in row] for row in rows]
-        page = resources.files("kalmark.results") / "page"
-        return (page / "campaign.html").read_text(encoding="utf-8").format(
+        return read_page("campaign.html").format(
             title=html.escape(title),
-            style=(page / "report.css").read_text(encoding="utf-8"),
-            figures="".join(f"<span>{html.escape(text)}</span>" for text in told),
-            head="".join(f"<th>{html.escape(cell)}</th>" for cell in head),
-            rows="".join(f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in cells),
+            style=read_page("report.css"),
+            figures=spans(told),
+            table=html_table([[figure_text(cell) for cell in row] for row in rows], head),
             picture=base64.b64encode(picture.read_bytes()).decode("ascii"),
             config=html.escape(first.description),
             of=" of the first cell" if self.keys else "",

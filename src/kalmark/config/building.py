@@ -324,14 +324,12 @@ def _other_columns(
     columns: tuple[str, ...],
 ) -> LogError:  # fmt: skip
     """Return the error of columns other than those wanted, with a type that has them or the column that was meant."""
-    where = f"{log.places[robot, sensor][0]}:1" if (robot, sensor) in log.places else log.path
     missing = [name for name in columns if name not in given]
     meant = next(filter(None, (did_you_mean(name, missing) for name in given if name not in columns)), "")
     hint = f"; try --set robots.{key}.type={fitting[0]}" if fitting else meant
     if given == (*columns, "z_m"):
         hint = "; leave z_m out, on the globe height_m: the robot is in the plane"
-    what = f"the scans of {robot} by {sensor}" if sensor else f"the controls of {robot}"
-    return LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}{hint}")
+    return log.other_columns(robot, sensor, given, wanted + hint)
 
 
 def _fitting(role: str, columns: tuple[str, ...]) -> list[str | None]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.config.tree import OVERRIDE, Tree, quote_value
+from kalmark.config.tree import Tree, folder_beside, quote_value
 from kalmark.declare import class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import is_number, largest_magnitude
@@ -105,9 +105,9 @@ def _take(tree: Tree, path: Path | None, where: tuple[str, ...], section: Any) -
         of_camera = "the path of a camera's calibration, or {file: PATH, camera: NAME}"
         wanted = "the path of Kalibr's imu.yaml" if key == KEY else of_camera
         raise ConfigError(f"{name}: got {quote_value(given)}, expected {wanted}")
-    beside = Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
+    there = folder_beside(path, place) / file
     try:
-        found = data_sheet(beside / file) if key == KEY else calibration(beside / file, camera)
+        found = data_sheet(there) if key == KEY else calibration(there, camera)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from None
     if key == CALIBRATION and not _has("sensor", section["type"], "lens"):

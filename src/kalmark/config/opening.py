@@ -148,8 +148,13 @@ def resolve_path(config: Config, path: Any) -> Any:
     """
     if path is None or isinstance(path, dict):
         return {robot: resolve_path(config, each) for robot, each in path.items()} if path else None
-    own = config.file is not None and config.file not in shipped_configs().values()
-    return str(find_data(path, config.file.resolve().parent if config.file and own else None).resolve())
+    return str(find_data(path, own_folder(config)).resolve())
+
+
+def own_folder(config: Config) -> Path | None:
+    """Return the folder of a configuration's file, None of a shipped one."""
+    shipped = config.file is None or config.file in shipped_configs().values()
+    return None if shipped or config.file is None else config.file.resolve().parent
 
 
 def find_log(config: Config, log_path: str | Path | None = None) -> Path:
@@ -162,8 +167,7 @@ def find_log(config: Config, log_path: str | Path | None = None) -> Path:
         return find_data(log_path).resolve()
     if config.log.path is None:
         raise config.error(("log", "path"), "got nothing, expected the path of a log: here, or with --log PATH")
-    own = config.file is not None and config.file not in shipped_configs().values()
-    beside = config.file.resolve().parent if config.file and own and not config.overridden("log", "path") else None
+    beside = None if config.overridden("log", "path") else own_folder(config)
     try:
         return find_data(config.log.path, beside).resolve()
     except LogError as error:

@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from kalmark.config.data_sheets import take_data_sheets
 from kalmark.config.schema import Config
-from kalmark.config.tree import OVERRIDE, Tree, quote_value, read_tree
+from kalmark.config.tree import Tree, folder_beside, quote_value, read_tree
 from kalmark.declare import classes, load_plugin
 from kalmark.errors import ConfigError, KalmarkError
 
@@ -67,12 +67,12 @@ def run_plugins(tree: Tree, path: Path | None) -> None:
     plugins = tree.values.get("plugins")
     for n, plugin in enumerate(plugins if isinstance(plugins, list) else ()):
         place = tree.place(("plugins", str(n)))
-        beside = Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
+        file = folder_beside(path, place) / str(plugin)
         try:
-            load_plugin(beside / str(plugin))
+            load_plugin(file)
         except KalmarkError as error:
             raise ConfigError(f"{place}: plugins: {error}") from None
-        tree.values["plugins"][n] = str((beside / str(plugin)).resolve())
+        tree.values["plugins"][n] = str(file.resolve())
 
 
 def shipped_configs(folder: str = "configs") -> dict[str, Path]:

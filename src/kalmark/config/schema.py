@@ -26,7 +26,7 @@ from kalmark.config.sections import (
     unexpected_value,
     unknown_key,
 )
-from kalmark.config.tree import OVERRIDE, name_of
+from kalmark.config.tree import OVERRIDE, name_of, place_around
 from kalmark.declare import classes, register, registered_name
 from kalmark.errors import ConfigError
 from kalmark.events import LONGEST_PAUSE_S
@@ -476,12 +476,9 @@ class Config(OfFile):
 
     def overridden(self, *path: str) -> bool:
         """Return whether an override gave the value at `path`."""
-        return self._place(path).startswith(OVERRIDE)
+        return place_around(self._where, path).startswith(OVERRIDE)
 
     def error(self, path: tuple[str, ...], message: str) -> ConfigError:
         """Return the error of the value at `path`, naming the place it was read from."""
-        where = self._place(path)
+        where = place_around(self._where, path)
         return ConfigError(f"{where + ': ' if where else ''}{'.'.join(path)}: {message}")
-
-    def _place(self, path: tuple[str, ...]) -> str:
-        return next((self._where[path[:n]] for n in range(len(path), -1, -1) if path[:n] in self._where), "")

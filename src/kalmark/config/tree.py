@@ -7,7 +7,7 @@ override of `each` is one of all entries; one of a name that the file does not h
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,7 +54,7 @@ class Tree:
         """Return where the value (or its key) at `path` was written, or the nearest thing around it."""
         if of_key and path in self.keys:
             return self.keys[path]
-        return next((self.places[path[:n]] for n in range(len(path), -1, -1) if path[:n] in self.places), "")
+        return place_around(self.places, path)
 
     def share(self, node: dict[str, Any], path: tuple[str, ...], name: str) -> None:
         """Lay the entry `name` of the mapping `node`, at `path`, over its `each`, which then was written there, too."""
@@ -63,6 +63,16 @@ class Tree:
         for table in (self.keys, self.places):
             for p in [p for p in table if p[: len(path) + 1] == (*path, EACH)]:
                 table.setdefault((*path, name, *p[len(path) + 1 :]), table[p])
+
+
+def place_around(places: Mapping[tuple[str, ...], str], path: tuple[str, ...]) -> str:
+    """Return the place of the value at `path`, or of the nearest thing around it, "" if none is known."""
+    return next((places[path[:n]] for n in range(len(path), -1, -1) if path[:n] in places), "")
+
+
+def folder_beside(path: Path | None, place: str) -> Path:
+    """Return the folder for files named at a place of the file `path`; for those of an override the working folder."""
+    return Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
 
 
 def merge_trees(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

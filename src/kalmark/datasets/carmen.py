@@ -28,7 +28,16 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log
-from kalmark.logs.source import STEP_NS, Format, Request, nanoseconds_of_text, number_of_text, one_robot, text_rows
+from kalmark.logs.source import (
+    STEP_NS,
+    Format,
+    Request,
+    begins_with,
+    nanoseconds_of_text,
+    number_of_text,
+    one_robot,
+    text_rows,
+)
 from kalmark.logs.table_columns import BEAM, INCREMENT2
 
 ROBOT = "robot"
@@ -146,11 +155,8 @@ def read(path: Path, request: Request) -> Log:
 
 def find(path: Path) -> Path | None:
     """Return the file if one of its first lines is a message of CARMEN."""
-    if not path.is_file() or path.suffix not in (".log", ".clf", ".carmen"):
-        return None
-    with path.open("rb") as stream:
-        begin = b"\n" + stream.read(65536)
-    return path if any(b"\n" + start in begin for start in STARTS) else None
+    known = path.is_file() and path.suffix in (".log", ".clf", ".carmen")
+    return path if known and begins_with(path, STARTS) else None
 
 
 CARMEN = Format("carmen", "a log of CARMEN (.log, .clf): FLASER, RLASER, ODOM, ROBOTLASER1", find, read)

@@ -32,6 +32,7 @@ from kalmark.logs.source import (
     STEP_NS,
     Format,
     Request,
+    begins_with,
     file_in,
     landmark_id,
     number_of_text,
@@ -59,11 +60,7 @@ class Record(NamedTuple):
 def find(path: Path, name: str, starts: tuple[bytes, ...]) -> Path | None:
     """Return the file of this name, given it or its folder, if one of its first lines has one of these starts."""
     file = file_in(path, name)
-    if not file.is_file():
-        return None
-    with file.open("rb") as stream:
-        begin = b"\n" + stream.read(8192)
-    return file if any(b"\n" + start in begin for start in starts) else None
+    return file if file.is_file() and begins_with(file, starts, 8192) else None
 
 
 def events_of(

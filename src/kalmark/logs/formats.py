@@ -140,8 +140,10 @@ def with_poses(
     log: Log, request: Request, truth: Any, fixes: Any, sigma_m: float | None, sigma_z_m: float | None
 ) -> Log:
     """Return the log with true poses and fixes of other files.  Raises LogError."""
-    true = {robot: read_path(path, request) for robot, path in _by_robot(log, "truth", truth).items()}
-    places = {robot: read_path(path, request) for robot, path in _by_robot(log, "fixes", fixes).items()}
+    true, places = (
+        {robot: read_path(path, request) for robot, path in _by_robot(log, name, given).items()}
+        for name, given in (("truth", truth), ("fixes", fixes))
+    )
     if (sigma_m is None) != (fixes is None) or (sigma_m is None and sigma_z_m is not None):
         raise LogError(
             f"log option fixes is {short_text(fixes)} and sigma_fixes_m is {short_text(sigma_m)}, expected both: a "

@@ -12,7 +12,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Id
 from kalmark.logs.geodesy import Globe
-from kalmark.logs.source import Request
+from kalmark.logs.source import Request, raise_refusal
 from kalmark.logs.table import Refused, Row, read_table
 
 PLACES = ("x_m", "y_m", "z_m", "signature", "qx", "qy", "qz", "qw")
@@ -47,24 +47,17 @@ def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> 
     def take(row: Row) -> None:
         if "mark" in row.table.index and row.text("mark"):
             return
-        name, names = row.id(), tuple(n for n in PLACES if n in row.table.index and row.text(n))
-        if name is None:
-            raise Refused("id is empty, expected the landmark's id")
-        if name in found:
-            raise Refused(f"id {name} is in this file already, expected each landmark once")
+        name, names = row.new_id(found), tuple(n for n in PLACES if n in row.table.index and row.text(n))
         if names not in KINDS:
             raise Refused(f"{', '.join(names) or 'no place'}, expected the place of a point or the pose of a tag")
         mean = np.array(row.numbers(names))
         found[name] = KnownLandmark(name, mean, None if exact else _covariance(row, names), names)
 
-    def refuse(line: str) -> None:
-        raise LogError(line)
-
     allowed, globe = ("kind", "observations", "known", "log_odds", "mark", *PLACES[2:]), Globe(origin)
     table = read_table(path, ("id", "x_m", "y_m"), allowed=allowed, globe=globe)
     if table.globe is not None and origin is None:
         raise LogError(f"{path}: lat_deg and lon_deg, but the log has no origin on the globe, expected log.origin")
-    table.each(Request(None, refuse, []), take, timed=False)
+    table.each(Request(None, raise_refusal, []), take, timed=False)
     return [*found.values()]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -133,6 +133,12 @@ class PositionTrack:
         for name, value in (("t_ns", t_ns), ("xy", xy), ("antenna", antenna)):
             object.__setattr__(self, name, value)
 
+    @classmethod
+    def of(cls, rows: Sequence[tuple[int, Any]]) -> PositionTrack:
+        """Return the track of times (ns) and positions with their antenna (4,), which is that of the first."""
+        values = np.array([row for _, row in rows])
+        return cls(np.array([t_ns for t_ns, _ in rows]), values[:, :2], values[0, 2:])
+
     def __len__(self) -> int:
         return len(self.t_ns)
 
@@ -184,6 +190,12 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.events)
+
+    def other_columns(self, robot: str, sensor: str, given: Iterable[str], wanted: str) -> LogError:
+        """Return the error of other columns than are `wanted` of a robot's controls (sensor ""), or of its scans."""
+        where = f"{self.places[robot, sensor][0]}:1" if (robot, sensor) in self.places else self.path or "log"
+        what = f"the scans of {robot} by {sensor}" if sensor else f"the controls of {robot}"
+        return LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}")
 
     def without_truth(self) -> Log:
         """Return the log without all that only scores a run: true poses, landmarks and ids, `gps`, `reference`."""

@@ -298,11 +298,7 @@ class _Reader:
 
         def take(row: Row) -> None:
             given = tuple(name for name in row.table.value_columns if row.text(name) or name in LANDMARK3[:2])
-            name, values = row.id(), row.numbers(given)
-            if name is None:
-                raise Refused("id is empty, expected the landmark's id")
-            if name in self.landmarks:
-                raise Refused(f"id {name} is in this file already, expected each landmark once")
+            name, values = row.new_id(self.landmarks), row.numbers(given)
             if given not in LANDMARKS:
                 raise Refused(f"{', '.join(given)}, expected a point, both ends of a line or the pose of a tag")
             self.landmarks[name] = np.array(values)
@@ -312,20 +308,16 @@ class _Reader:
 
     def read_gps(self, path: Path | Content) -> None:
         """Read `gps.csv`: position fixes that only score a run."""
-        tracks: dict[str, tuple[list[int], list[list[float]]]] = {}
+        tracks: dict[str, list[tuple[int, list[float]]]] = {}
 
         def take(row: Row) -> None:
-            values = row.numbers(GPS)
-            times, rows = tracks.setdefault(row.robot, ([], []))
-            if rows and values[2:] != rows[0][2:]:
-                raise Refused(f"antenna is {values[2:]}, expected {rows[0][2:]} as in the robot's first row")
-            times.append(row.t_ns)
-            rows.append(values)
+            values, rows = row.numbers(GPS), tracks.setdefault(row.robot, [])
+            if rows and values[2:] != rows[0][1][2:]:
+                raise Refused(f"antenna is {values[2:]}, expected {rows[0][1][2:]} as in the robot's first row")
+            rows.append((row.t_ns, values))
 
         read_table(path, ("t_s", "robot", *GPS), allowed=(), globe=self.globe).each(self.request, take)
-        for robot, (times, rows) in tracks.items():
-            track = np.array(rows)
-            self.gps[robot] = PositionTrack(np.array(times), track[:, :2], track[0, 2:])
+        self.gps = {robot: PositionTrack.of(rows) for robot, rows in tracks.items()}
 
 
 def known_columns(own: tuple[str, ...] = CANONICAL) -> tuple[str, ...]:

@@ -131,6 +131,13 @@ def file_in(path: Path, name: str) -> Path:
     return path / name if path.is_dir() else path
 
 
+def begins_with(file: Path, starts: Iterable[bytes], size: int = 65536) -> bool:
+    """Return whether a line among the first bytes of a file has one of these starts."""
+    with file.open("rb") as stream:
+        begin = b"\n" + stream.read(size)
+    return any(b"\n" + start in begin for start in starts)
+
+
 def folder_of(path: Path, names: Iterable[str]) -> Path | None:
     """Return the folder that `path` is, or is in as one of these files, if it holds at least one of them."""
     folder = path if path.is_dir() else path.parent

@@ -11,7 +11,7 @@ import io
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Container, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
@@ -379,6 +379,15 @@ class Row:
             return landmark_id(text) if text else None
         except ValueError as error:
             raise Refused(f"id: {error}") from None
+
+    def new_id(self, known: Container[Id]) -> Id:
+        """Return the id of a landmark that is not known yet.  Raises Refused."""
+        name = self.id()
+        if name is None:
+            raise Refused("id is empty, expected the landmark's id")
+        if name in known:
+            raise Refused(f"id {name} is in this file already, expected each landmark once")
+        return name
 
     def number(self, column: str) -> float:
         """Return the finite number in a column, in kalmark's unit.  Raises ValueError."""

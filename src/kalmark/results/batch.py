@@ -29,7 +29,7 @@ from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.figure_texts import Figures
 from kalmark.results.filter_description import mounts_of
-from kalmark.results.history import History, RobotStart, as_id
+from kalmark.results.history import History, RobotStart, as_id, ints
 from kalmark.results.landmark_table import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
 from kalmark.results.restarts import Restart, restarts
@@ -331,7 +331,7 @@ def compare_with_filter(run: Recording, batch: Batch, merged: Mapping[Id, Id] | 
     """
     at, same, mine = {id_: j for j, id_ in enumerate(batch.ids)}, merged or {}, filtered_map(run)
     rows = [(id_, at[same.get(id_, id_)]) for id_ in mine if same.get(id_, id_) in at]
-    d, sigma = batch.state.d, batch.sigma()[np.array([j for _, j in rows], dtype=np.int64)]
+    d, sigma = batch.state.d, batch.sigma()[ints([j for _, j in rows])]
     distance = np.array([np.linalg.norm(mine[k][0][:d] - batch.means[j][:d]) for k, j in rows])
     filtered = np.array([np.sqrt(np.trace(mine[k][1][:d, :d])) for k, _ in rows])
     free, path, truth = sigma > 0, run.history.mean[:, :d], run.truth.poses_in_map()

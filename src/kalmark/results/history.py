@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from itertools import compress
+from itertools import chain, compress
 from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
@@ -475,24 +475,21 @@ class History:
         """Return everything as named arrays, those of the contract among them (t in seconds)."""
         named: Arrays = {"t": self.t_ns * 1e-9}
         named |= {name: vars(self)[name] for name in _array_fields()}
-        blocks = [m.covariances for m in self.maps]
-        width = max((block.shape[1] for block in blocks), default=2)
+        kept: Any = zip(*self.maps, strict=True) if self.maps else [()] * len(MapSnapshot._fields)
+        step, t_ns, ids, means, covariances, kinds, shapes, robots, correlations = kept
+        sizes, width = [*map(len, ids)], max((block.shape[1] for block in covariances), default=2)
         named |= {
-            "map_step": np.array([m.step for m in self.maps], dtype=np.int64),
-            "map_t_ns": np.array([m.t_ns for m in self.maps], dtype=np.int64),
-            "map_shape": pad_blocks(
-                [m.shape for m in self.maps], [len(m.ids) for m in self.maps], width, matrices=True
-            ),
-            "map_robot": np.array([m.robots for m in self.maps]).reshape(
-                len(self.maps), -1 if self.maps else 0, self.d, self.d
-            ),
-            "map_size": np.array([len(m.ids) for m in self.maps], dtype=np.int64),
-            "map_landmark": texts([i for m in self.maps for i in m.ids]),
-            "map_kind": texts([kind for m in self.maps for kind in m.kinds]),
-            "map_mean": padded_all([mean for m in self.maps for mean in m.means]),
-            "map_covariance": pad_blocks(blocks, [len(block) for block in blocks], width, matrices=True),
-            "map_order": np.array([len(m.correlations) for m in self.maps], dtype=np.int64),
-            "map_correlation": np.concatenate([NONE.ravel(), *(m.correlations.ravel() for m in self.maps)]),
+            "map_step": ints(step),
+            "map_t_ns": ints(t_ns),
+            "map_shape": pad_blocks(shapes, sizes, width, matrices=True),
+            "map_robot": np.array(robots).reshape(len(step), -1 if step else 0, self.d, self.d),
+            "map_size": ints(sizes),
+            "map_landmark": texts([*chain(*ids)]),
+            "map_kind": texts([*chain(*kinds)]),
+            "map_mean": padded_all([*chain(*means)]),
+            "map_covariance": pad_blocks(covariances, sizes, width, matrices=True),
+            "map_order": ints([*map(len, correlations)]),
+            "map_correlation": np.concatenate([NONE.ravel(), *(each.ravel() for each in correlations)]),
         }
         named["stepped"] = np.array(self.stepped, dtype=np.str_)
         named["control_robot"] = texts(list(self.controls))
@@ -580,12 +577,17 @@ def rows_of_arrays(prefix: str, cls: type[R], named: Named, joined: bool = False
     return tuple(cls(*row) for row in zip(*told, strict=True))
 
 
+def ints(values: Sequence[int]) -> Ints:
+    """Return integers as an array (N,)."""
+    return np.array(values, dtype=np.int64)
+
+
 def texts(values: list[Any]) -> Texts:
     """Return ids or names as an array of texts (N,), "" for None."""
     return np.array(["" if value is None else str(value) for value in values], dtype=np.str_)
 
 
-def pad_blocks(blocks: list[Array], counts: list[int], width: int, matrices: bool = False) -> Array:
+def pad_blocks(blocks: Sequence[Array], counts: list[int], width: int, matrices: bool = False) -> Array:
     """Stack blocks (K, m) or (K, m, m) of several sizes m, K by `counts`, padded with NaN; an empty one is all NaN."""
     out = np.full((sum(counts), width, width) if matrices else (sum(counts), width), np.nan)
     whole = [len(block) == count and block.size > 0 for block, count in zip(blocks, counts, strict=True)]

@@ -38,6 +38,7 @@ from kalmark.results.history import (
     RelocatedRobot,
     RobotStart,
     UsedFix,
+    ints,
     pad_blocks,
     texts,
 )
@@ -293,15 +294,15 @@ class _Recorder:
         known = [self.log.true_ids.get(scan, scan.ids) for scan in self.scans]  # also those that the filter did not get
         ones = [1] * len(reports)
         return History(
-            t_ns=np.array([r.t_ns for r in reports], dtype=np.int64),
+            t_ns=ints([r.t_ns for r in reports]),
             robot=texts([r.robot for r in reports]),
             mean=pad_blocks([mean[None] for mean, _ in self.states], ones, n),
             covariance=pad_blocks([P[None] for _, P in self.states], ones, q, matrices=True),
             dead_reckoned=pad_blocks([r[None] for r in self.dead], ones, n),
             step_us=np.array(self.step_ns, dtype=np.float64) * 1e-3,
-            step=np.array([s for s, _, _ in rows], dtype=np.int64),
+            step=ints([s for s, _, _ in rows]),
             sensor=texts([scan.sensor for _, scan, _ in rows]),
-            index=np.array([o.index for o in seen], dtype=np.int64),
+            index=ints([o.index for o in seen]),
             id=texts([None if scan.ids is None else scan.ids[o.index] for _, scan, o in rows]),
             outcome=texts([o.outcome for o in seen]),
             landmark=texts([o.landmark for o in seen]),
@@ -357,13 +358,13 @@ def decisions(reports: list[Report], d: int) -> dict[str, Any]:
         )
     ]
     return {
-        "candidate_row": np.array([row for row, _ in seen], dtype=np.int64),
+        "candidate_row": ints([row for row, _ in seen]),
         "candidate_landmark": texts([c.landmark for _, c in seen]),
         "candidate_d2": np.array([c.d2 for _, c in seen], dtype=np.float64),
         "candidate_place": np.array([c.place for _, c in seen], dtype=np.float64).reshape(-1, d),
         "seen_at": pad_blocks([report.seen_at for report in reports], counts, d),
         "changes": tuple(changes),
-        "share_row": np.array([row for row, _, _ in shares], dtype=np.int64),
+        "share_row": ints([row for row, _, _ in shares]),
         "share_landmark": texts([name for _, name, _ in shares]),
         "share_weight": np.array([weight for _, _, weight in shares], dtype=np.float64),
     }
@@ -375,24 +376,22 @@ def refuse_other_columns(slam: Slam, log: Log) -> None:
     Columns that are not known come last, in the file's order: a misspelt one would be taken for another number.
     Raises LogError.
     """
-    taken: list[tuple[str, str, str, Any, Any]] = [
-        (robot, "", f"the controls of {robot}", given, slam.robots[robot].motion)
+    taken: list[tuple[str, str, Any, Any]] = [
+        (robot, "", given, slam.robots[robot].motion)
         for robot, given in log.control_columns.items()
         if robot in slam.robots
     ]
     for (robot, sensor), given in log.sensor_columns.items():
         mount = slam.robots[robot].sensors.get(sensor) if robot in slam.robots else None
         if mount is not None and mount.detector is None:
-            taken.append((robot, sensor, f"the scans of {robot} by {sensor}", given, mount.sensor))
-    for robot, sensor, what, given, model in taken:
+            taken.append((robot, sensor, given, mount.sensor))
+    for robot, sensor, given, model in taken:
         columns = tuple(model.columns)
         if is_own(type(model)) and registered_name(type(model)) and tuple(given) != columns:
             missing = [name for name in columns if name not in given]
             hint = next(filter(None, (spelling_hint(name, missing) for name in given if name not in columns)), "")
-            place = log.places.get((robot, sensor))
-            where = f"{place[0]}:1" if place is not None else log.path or "log"
-            wanted = f"{', '.join(columns)} of its {type(model).__name__}"
-            raise LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}{hint}")
+            wanted = f"{', '.join(columns)} of its {type(model).__name__}{hint}"
+            raise log.other_columns(robot, sensor, given, wanted)
 
 
 def refuse_other_times(log: Log) -> None:

@@ -30,7 +30,7 @@ from kalmark.files import csv_text, hold_lock, read_arrays, refuse_aliases, repl
 from kalmark.logs.poses import tum_text
 from kalmark.logs.source import LeftOut, records_of
 from kalmark.results.figure_texts import Figures
-from kalmark.results.history import History
+from kalmark.results.history import History, ints
 from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.truth import Truth
 from kalmark.slam.description import plain_value
@@ -251,7 +251,7 @@ class Recording:
                     config=read_yaml(folder / "config.yaml"),
                     landmarks=MapLandmarks.read(folder / "landmarks.csv"),
                     truth=Truth.from_arrays(named),
-                    log=LogReference(log["name"], log["format"], log["path"], tuple(log["robots"])),
+                    log=LogReference(**log | {"robots": tuple(log["robots"])}),
                     coordinates=summary["coordinates"],
                     wall_s=summary["wall_s"],
                     skipped=[
@@ -289,6 +289,6 @@ class Recording:
     def _save_arrays(self, path: Path) -> None:
         arrays: dict[str, Any] = {**self.history.arrays(), **self.truth.arrays()}
         arrays["skipped"] = np.array(self.skipped, dtype=np.str_)
-        arrays["skipped_records"] = np.array([records_of(line) for line in self.skipped], dtype=np.int64)
+        arrays["skipped_records"] = ints([records_of(line) for line in self.skipped])
         arrays["reference"] = np.array(list(self.reference), dtype=np.str_)
         _savez(path, arrays)

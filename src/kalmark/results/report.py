@@ -104,10 +104,10 @@ def report_html(run: Recording, world: bool = False) -> str:
     summary, scene = summary_of(run), Scene.of(run, world=world)
     verdict = summary.get("verdict")
     notes = [*summary.get("notes", ()), *summary.get("advice", ())]
-    return _resource("report.html").format(
+    return read_page("report.html").format(
         title=html.escape(title),
-        style=_resource("report.css"),
-        figures="".join(f"<span>{html.escape(figure)}</span>" for figure in figures),
+        style=read_page("report.css"),
+        figures=spans(figures),
         robots=robot_table(summary),
         summary=summary_table(summary),
         map="" if verdict is None else overall(verdict),
@@ -116,14 +116,14 @@ def report_html(run: Recording, world: bool = False) -> str:
         advice=_items(notes),
         mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS)
         + _section(DIFFERENCE_TITLE, difference_rows(summary), DIFFERENCE_COLUMNS),
-        reasons=_table(common_reasons(run), ("outcome", "reason", "observations")),
+        reasons=html_table(common_reasons(run), ("outcome", "reason", "observations")),
         changes=_section("Landmarks merged and removed", [*change_rows(run)], ("t (s)", "landmark", "", "why")),
         skipped=_skipped(run, summary),
         config=html.escape(config_yaml(run.config)),
         plotly=get_plotlyjs(),
         data=json.dumps(series(run, scene), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c"),
-        scene=_resource("scene.js"),
-        script=_resource("report.js"),
+        scene=read_page("scene.js"),
+        script=read_page("report.js"),
         hint=map_hint(scene),
     )
 
@@ -139,7 +139,7 @@ def robot_table(summary: Figures) -> str:
     robots = summary["robots"]
     columns = [row for row in _ROBOT if any(row[0] in figures for figures in robots.values())]
     rows = [(name, *(figure_text(f.get(key), unit) for key, _, unit in columns)) for name, f in robots.items()]
-    return _table(rows, ("robot", *(column_header(label, unit) for _, label, unit in columns)))
+    return html_table(rows, ("robot", *(column_header(label, unit) for _, label, unit in columns)))
 
 
 def summary_table(summary: Figures) -> str:
@@ -179,16 +179,22 @@ def _flat(summary: Figures, prefix: str = "") -> list[tuple[str, Any]]:
     return out
 
 
-def _table(rows: list[Any], head: tuple[str, ...] = ()) -> str:
+def spans(texts: Iterable[str]) -> str:
+    """Return texts side by side."""
+    return "".join(f"<span>{html.escape(text)}</span>" for text in texts)
+
+
+def html_table(rows: Sequence[Sequence[Any]], head: Sequence[str]) -> str:
+    """Return a table with a head, nothing without rows."""
     if not rows:
         return ""
-    top = "<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in head) + "</tr>" if head else ""
+    top = "<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in head) + "</tr>"
     body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table>{top}{body}</table>"
 
 
 def _section(title: str, rows: list[Any], head: tuple[str, ...]) -> str:
-    return f"<h2>{title}</h2>{_table(rows, head)}" if rows else ""
+    return f"<h2>{title}</h2>{html_table(rows, head)}" if rows else ""
 
 
 def _skipped(run: Recording, summary: Figures) -> str:
@@ -199,7 +205,8 @@ def _skipped(run: Recording, summary: Figures) -> str:
     return f"<h2>Left out <small>{summary['skipped']}</small></h2><pre>{shown}</pre>"
 
 
-def _resource(name: str) -> str:
+def read_page(name: str) -> str:
+    """Return a part of a page."""
     return (resources.files("kalmark.results") / "page" / name).read_text(encoding="utf-8")
 
 

@@ -177,7 +177,7 @@ class Scene:
         return "" if self.picture.ellipses == "off" else f", {self.picture.sigmas:g}σ{of} {self.of_what}"
 
     def rings(self, means: Array, covariances: Array) -> Array:
-        """Return the contours of Gaussians as one polyline (N, d), NaN between them; NaN alone if they are not drawn."""
+        """Return the contours of Gaussians as one polyline (N, d), NaN between them, and alone if none are drawn."""
         if self.picture.ellipses == "off":
             return np.full((1, self.d), np.nan)
         return join_polylines(np.concatenate(contours(means, covariances, self.picture.sigmas)), self.d)

@@ -13,7 +13,7 @@ from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.logs.log import Log, PositionTrack, poses_of_size
-from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, padded_all, texts
+from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, ints, padded_all, texts
 from kalmark.results.landmark_table import TAG
 from kalmark.results.measures import Rigid, pose_error, sigmas
 
@@ -74,7 +74,7 @@ class Truth:
 
     def arrays(self) -> Arrays:
         """Return everything as named arrays for ``history.npz``."""
-        robots = list(self.fixes)
+        tracks = [*self.fixes.values()]
         return {
             "truth": self.poses,
             "truth_offset": self.offset,
@@ -82,11 +82,11 @@ class Truth:
             "truth_robot": texts(list(self.robots)),
             "truth_landmark": texts(list(self.landmarks)),
             "truth_landmark_mean": padded_all(list(self.landmarks.values())),
-            "fix_robot": texts(robots),
-            "fix_size": np.array([len(self.fixes[r].t_ns) for r in robots], dtype=np.int64),
-            "fix_t_ns": np.concatenate([self.fixes[r].t_ns for r in robots] or [np.empty(0, dtype=np.int64)]),
-            "fix_mean": np.concatenate([self.fixes[r].xy for r in robots] or [np.empty((0, 2))]),
-            "fix_antenna": np.array([self.fixes[r].antenna for r in robots], dtype=np.float64),
+            "fix_robot": texts(list(self.fixes)),
+            "fix_size": ints([*map(len, tracks)]),
+            "fix_t_ns": np.concatenate([ints(()), *(track.t_ns for track in tracks)]),
+            "fix_mean": np.concatenate([np.empty((0, 2)), *(track.xy for track in tracks)]),
+            "fix_antenna": np.array([track.antenna for track in tracks], dtype=np.float64),
         }
 
     @classmethod

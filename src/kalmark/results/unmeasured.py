@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.report import Expectations, Report
-from kalmark.results.history import padded_all, texts
+from kalmark.results.history import ints, padded_all, texts
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
@@ -80,7 +80,7 @@ class ExpectationRecorder:
         e = padded_all([np.full(m, np.nan), *(asked.e[i] for _, asked, i in each)])[1:]
         Z = padded_all([np.full((p, p), np.nan), *(asked.Z[i] for _, asked, i in each)], 2)[1:]
         return {
-            "unmeasured_step": np.array([step for step, _, _ in each], dtype=np.int64),
+            "unmeasured_step": ints([step for step, _, _ in each]),
             "unmeasured_sensor": texts([asked.sensor for _, asked, _ in each]),
             "unmeasured_landmark": texts([asked.names[i] for _, asked, i in each]),
             "unmeasured_kind": texts([asked.kinds[i] for _, asked, i in each]),
