@@ -21,7 +21,7 @@ from kalmark.logs.source import landmark_id, nanoseconds_of_text
 from kalmark.logs.table import PARQUET, cov_columns
 from kalmark.logs.table_columns import CANONICAL, GPS, NAMES, POSE2, POSE3, POSITION
 
-Row = dict[str, str]
+Row = dict[str, Any]
 FRAMES, IMAGES = "frames.csv", "images"
 PICTURES = "image", "depth", "right"  # columns of FRAMES that name files
 
@@ -89,12 +89,10 @@ def write_parquet(path: Path, header: Sequence[str], rows: Sequence[Row]) -> Non
 
     columns: dict[str, Any] = {}
     for name in header:
-        told = [row.get(name) or None for row in rows]
         if name == "t_s":
-            columns["t_ns"] = [nanoseconds_of_text(text) if text else None for text in told]
+            columns["t_ns"] = [nanoseconds_of_text(row[name]) for row in rows]
         else:
-            texts = name in ("robot", "sensor", "id")
-            columns[name] = told if texts else [None if text is None else float(text) for text in told]
+            columns[name] = [None if row.get(name) == "" else row.get(name) for row in rows]
     pyarrow.parquet.write_table(pyarrow.table(columns), path)
 
 
@@ -153,7 +151,7 @@ def fixes(log: Log) -> Iterator[Row]:
     for f in log:
         if isinstance(f, Fix):
             noise = upper_triangle(f.cov, f"fix at {f.t_s} s", "xyz")
-            yield time_and_robot(f) | texts_of_columns(POSITION, f.y) | noise
+            yield time_and_robot(f) | by_column(POSITION, f.y) | noise
 
 
 def truth(log: Log) -> Iterator[Row]:
@@ -163,7 +161,7 @@ def truth(log: Log) -> Iterator[Row]:
         raise LogError("truth holds poses in the plane and in space, expected one kind")
     for robot, path in log.truth.items():
         for t, pose in zip(path.t_ns.tolist(), path.poses, strict=True):
-            told = texts_of_columns(POSE3 if sizes == {7} else POSE2, pose)
+            told = by_column(POSE3 if sizes == {7} else POSE2, pose)
             yield {"t_s": fixed_seconds(t), "robot": name(robot)} | told
 
 
@@ -173,14 +171,14 @@ def landmarks(log: Log) -> Iterator[Row]:
     sizes = {len(values) for values in log.landmarks.values()}
     if not (sizes <= {2, 4} or sizes <= {3, 6, 7}):
         raise LogError(f"landmarks have {', '.join(map(str, sorted(sizes)))} numbers, expected 2 and 4, or 3, 6 and 7")
-    return ({"id": id_text(id_)} | texts_of_columns(of_size[len(l)], l) for id_, l in log.landmarks.items())
+    return ({"id": id_text(id_)} | by_column(of_size[len(l)], l) for id_, l in log.landmarks.items())
 
 
 def gps(log: Log) -> Iterator[Row]:
     """Yield the rows of gps.csv."""
     for robot, track in log.gps.items():
         for t, xy in zip(track.t_ns.tolist(), track.xy, strict=True):
-            yield {"t_s": fixed_seconds(t), "robot": name(robot)} | texts_of_columns(GPS, [*xy, *track.antenna])
+            yield {"t_s": fixed_seconds(t), "robot": name(robot)} | by_column(GPS, [*xy, *track.antenna])
 
 
 def time_and_robot(event: Event) -> Row:
@@ -193,12 +191,12 @@ def numbers(columns: dict[Any, tuple[str, ...]], key: Any, values: Array) -> Row
     names = columns.get(key)
     if names is None or len(names) != len(values):
         raise LogError(f"columns of {key!r} are {names!r}, expected the names of its {len(values)} numbers")
-    return texts_of_columns(names, values)
+    return by_column(names, values)
 
 
-def texts_of_columns(columns: Sequence[str], values: Any) -> Row:
-    """Return numbers by column, as the shortest text that reads back as the same float."""
-    return {column: repr(float(value)) for column, value in zip(columns, values, strict=False)}
+def by_column(columns: Sequence[str], values: Any) -> Row:
+    """Return numbers by column."""
+    return {column: float(value) for column, value in zip(columns, values, strict=False)}
 
 
 def upper_triangle(cov: Array | None, what: str, axes: str = "0123456789") -> Row:
@@ -207,7 +205,7 @@ def upper_triangle(cov: Array | None, what: str, axes: str = "0123456789") -> Ro
         return {}
     if not np.array_equal(cov, cov.T):
         raise LogError(f"{what}: covariance {cov.tolist()} is not symmetric, expected a symmetric one")
-    return texts_of_columns(cov_columns(len(cov), axes), cov[np.triu_indices(len(cov))])
+    return by_column(cov_columns(len(cov), axes), cov[np.triu_indices(len(cov))])
 
 
 def name(text: str) -> str:

@@ -9,7 +9,6 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import plugin_of
-from kalmark.errors import MapError
 from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
@@ -101,7 +100,7 @@ def calibrated_mounts(slam: Slam) -> tuple[CalibratedMount, ...]:
             name, mean, slam.covariance(name), block[2], parameter_names(mount.sensor)[: len(mean) - len(mount.at)]
         )
         for name, mount in named.items()
-        if (block := mount.block(name)) is not None and _in_map(slam, name) and len(mean := slam.mean(name))
+        if (block := mount.block(name)) is not None and name in slam.tracks.slots and len(mean := slam.mean(name))
     )
 
 
@@ -110,22 +109,15 @@ def biases(slam: Slam) -> tuple[Biased, ...]:
     return tuple(
         Biased(robot.name, model.calibration, slam.mean(name), slam.covariance(name))
         for robot in slam.robots.values()
-        if (model := self_calibrating(robot.motion)) is not None and _in_map(slam, name := bias_name(robot.name))
+        if (model := self_calibrating(robot.motion)) is not None
+        and (name := bias_name(robot.name)) in slam.tracks.slots
     )
-
-
-def _in_map(slam: Slam, name: str) -> bool:
-    try:
-        slam.mean(name)
-    except MapError:
-        return False
-    return True
 
 
 def mount_now(slam: Slam, robot: str, sensor: str) -> Array:
     """Return the mount of a sensor: as given, or as estimated so far if its mount is in the map."""
     name, at = f"{robot}.{sensor}", slam.robots[robot].sensors[sensor].at
-    return np.array(slam.mean(name)[: len(at)] if _in_map(slam, name) else at, dtype=np.float64)
+    return np.array(slam.mean(name)[: len(at)] if name in slam.tracks.slots else at, dtype=np.float64)
 
 
 def observed_points(slam: Slam, robot: str, sensor: str, pose: Array, y: Array) -> Array:

@@ -33,7 +33,8 @@ Matrix = Annotated[Array, 2]
 Names = tuple[str, ...]
 Size = tuple[float, float]
 R = TypeVar("R", bound=tuple[Any, ...])
-K, V = TypeVar("K"), TypeVar("V")
+K = TypeVar("K")
+V = TypeVar("V")
 
 TYPES: dict[Any, Any] = {int: np.int64, bool: np.bool_, float: np.float64, str: np.str_}
 

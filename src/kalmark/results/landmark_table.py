@@ -68,15 +68,20 @@ def places(
     if model is None or model.space.kinds == SE3.kinds or isinstance(model, Point2D):
         return means, covariances
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        if isinstance(model, Segmented):
-            p, P_l = model.endpoints(means, np.array([model.first_ends if t is None else t for t in ends]))
-            p, P_l = p.reshape(len(means), -1), P_l.reshape(len(means), p[0].size, -1)
-        elif (found := place_of(model, means)) is not None:
-            p, P_l = found
-        else:
+        found = _places_of_states(model, means, ends)
+        if found is None:
             return None
+        p, P_l = found
         covariances = P_l @ covariances @ P_l.swapaxes(1, 2)
     return np.where(np.isfinite(p), p, np.inf), np.where(np.isfinite(covariances), covariances, np.inf)
+
+
+def _places_of_states(model: Landmark, means: Array, ends: Sequence[Array | None]) -> tuple[Array, Array] | None:
+    """Return the places (K, n) of states (K, n') and their Jacobians (K, m, dof), None if a model has no position."""
+    if not isinstance(model, Segmented):
+        return place_of(model, means)
+    p, P_l = model.endpoints(means, np.array([model.first_ends if t is None else t for t in ends]))
+    return p.reshape(len(means), -1), P_l.reshape(len(means), p[0].size, -1)
 
 
 class Shapes(NamedTuple):
@@ -135,13 +140,9 @@ def _place_jacobian(slam: Slam, name: Id) -> Array:
     """Return the Jacobian (m, dof) of a landmark's place in its error."""
     model = slam.landmark_model(name)
     assert model is not None  # it is in the map
-    dof = model.space.dof
-    if isinstance(model, Segmented):
-        t = slam.segment_ends(name)
-        P_l = model.endpoints(slam.mean(name)[None], np.array([model.first_ends if t is None else t]))[1]
-        return np.asarray(P_l.reshape(-1, dof))
-    found = None if model.kind in EUCLIDEAN else place_of(model, slam.mean(name)[None])
-    return np.eye(dof) if found is None else found[1][0]
+    own = model.kind in EUCLIDEAN
+    found = None if own else _places_of_states(model, slam.mean(name)[None], [slam.segment_ends(name)])
+    return np.eye(model.space.dof) if found is None else found[1][0]
 
 
 def _crosses(slam: Slam, names: Sequence[Id], others: Sequence[Id]) -> Iterator[tuple[Id, Array]]:
@@ -156,16 +157,9 @@ def _crosses(slam: Slam, names: Sequence[Id], others: Sequence[Id]) -> Iterator[
 
 def _parts(slam: Slam, names: Sequence[Id], P: Array, before: int) -> Iterator[tuple[Id, Array]]:
     """Yield the rows of each name in a joint covariance, without the columns of the names before the others."""
-    dofs = [slam.robots[str(name)].motion.space.dof if name in slam.robots else _dof(slam, name) for name in names]
-    ends = np.cumsum([0, *dofs]).tolist()
+    ends = np.cumsum([0, *(len(slam.map.rows(slam.slot(name))) for name in names)]).tolist()
     for name, first, end in zip(names, ends, ends[1:], strict=False):
         yield name, P[first:end, ends[-1] if before else 0 :]
-
-
-def _dof(slam: Slam, name: Id) -> int:
-    model = slam.landmark_model(name)
-    assert model is not None
-    return model.space.dof
 
 
 @dataclass(frozen=True)
@@ -304,7 +298,7 @@ class MapLandmarks:
         name, kind, mean, P = self.ids[k], self.kinds[k], self.means[k], self.covariances[k]
         axes = _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
         errors = _errors(axes)
-        cells = {"id": name, "kind": kind, "observations": self.observations[k]}
+        cells: dict[str, Any] = {"id": name, "kind": kind, "observations": self.observations[k]}
         cells |= zip(axes, mean.tolist(), strict=False)
         cells |= zip(_cov_names(errors), P[np.triu_indices(len(errors))].tolist(), strict=True)
         cells |= {"known": "exactly"} if name in self.exact else {}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -28,44 +27,26 @@ USED, UNUSED, UNMEASURED = "#0aa5b5", "#c8553d", "#1f3fd0"
 DEGREES = 180.0 / np.pi
 
 
-class Axis(NamedTuple):
-    """A column of a measurement as an axis: its number, the factor to what is drawn, and the label."""
-
-    column: int
-    scale: float
-    label: str
+def axes_of(sensor: Measuring) -> list[str]:
+    """Return the columns that are drawn to the right and upwards, [] if no two of the measurements can be."""
+    found = [next((name for name in names if name in sensor.columns), "") for names in (ACROSS, AHEAD)]
+    return found if all(found) else []
 
 
-def axes_of(sensor: Measuring) -> tuple[Axis, Axis] | None:
-    """Return the axes of a sensor's picture, None if its measurements have no two that can be drawn."""
-    found = [next((name for name in names if name in sensor.columns), None) for names in (ACROSS, AHEAD)]
-    if None in found:
-        return None
-    across, ahead = (_axis(str(name), sensor.columns.index(str(name))) for name in found)
-    return across, ahead
-
-
-def sensors_with_picture(history: History) -> list[Measuring]:
-    """Return the sensors of a run that have such a picture."""
-    return [sensor for sensor in history.sensors if axes_of(sensor) is not None]
-
-
-def _axis(name: str, column: int) -> Axis:
-    quantity, _, unit = name.rpartition("_")
-    return Axis(column, DEGREES, f"{quantity} (deg)") if unit == "rad" else Axis(column, 1.0, f"{quantity} ({unit})")
+def sensors_with_picture(history: History) -> list[Camera | Measuring]:
+    """Return the sensors of a run that have a picture: its cameras, and others that have `axes_of`."""
+    return [*history.cameras, *filter(axes_of, history.sensors)]
 
 
 def draw_measured(history: History, sensor: Measuring, step: int, options: Picture) -> Figure:
     """Return the figure of a scan by a sensor that has `axes_of`."""
-    found = axes_of(sensor)
-    assert found is not None
     mark, used_colour = options.colour("measured", INK), options.colour("landmarks_used", USED)
     unused, unmeasured = (options.colour("landmarks_predicted", usual) for usual in (UNUSED, UNMEASURED))
     rows = np.flatnonzero(history.step == step)
     in_map = bool(history.of_own[rows].any())  # of the robot's own position: x to the right, y upwards, as in the map
-    found = found[::-1] if in_map else found
-    columns = [axis.column for axis in found]
-    scale = np.array([axis.scale for axis in found])
+    drawn = axes_of(sensor)[:: -1 if in_map else 1]
+    columns = [sensor.columns.index(name) for name in drawn]
+    scale = np.array([DEGREES if name.endswith("_rad") else 1.0 for name in drawn])
     figure = Figure(figsize=(9.5, 7.0), layout="constrained", facecolor="white")
     axes = figure.subplots()
     y, e, Z = history.y[rows][:, columns] * scale, *_expected(history.e[rows], history.Z[rows], columns, scale)
@@ -90,8 +71,8 @@ def draw_measured(history: History, sensor: Measuring, step: int, options: Pictu
             handles.append(Line2D([], [], color=colour, ls=style, label=f"expected, $3\\sigma$, {what}"))
     names = [*history.landmark[rows].tolist(), *history.unmeasured_landmark[missed].tolist()]
     name_points(axes, np.vstack([y, e_m]), names, fontsize=8, color=INK)
-    axes.set_xlabel(found[0].label)
-    axes.set_ylabel(found[1].label)
+    axes.set_xlabel(_label(drawn[0]))
+    axes.set_ylabel(_label(drawn[1]))
     if not in_map:
         axes.invert_xaxis()  # what is on the left has positive bearings
     axes.grid(color="#eceef1")
@@ -99,6 +80,12 @@ def draw_measured(history: History, sensor: Measuring, step: int, options: Pictu
     title = scan_title(sensor, history.t_s[step], [*history.outcome[rows].tolist(), *[IN_VIEW] * len(missed)])
     add_title_and_legend(figure, title, handles)
     return figure
+
+
+def _label(column: str) -> str:
+    """Return a column with its unit, angles in degrees."""
+    quantity, _, unit = column.rpartition("_")
+    return f"{quantity} ({'deg' if unit == 'rad' else unit})"
 
 
 def scan_title(sensor: Camera | Measuring, t_s: float, outcomes: Iterable[str]) -> str:

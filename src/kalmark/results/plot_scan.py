@@ -20,7 +20,7 @@ from kalmark.picture_options import Picture
 from kalmark.results.camera_images import Pictures
 from kalmark.results.explain import Explanation, Fate
 from kalmark.results.figure_texts import figure as figure_of
-from kalmark.results.history import Camera, Measuring
+from kalmark.results.history import Measuring
 from kalmark.results.labels import name_points
 from kalmark.results.plot_measured import add_title_and_legend, draw_measured, scan_title, sensors_with_picture
 from kalmark.results.recording import Recording
@@ -140,8 +140,7 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     sensor or scan.
     """
     history = run.history
-    drawable: list[Camera | Measuring] = [*history.cameras, *sensors_with_picture(history)]
-    sensors = {(s.robot, s.sensor): s for s in drawable}
+    sensors = {(s.robot, s.sensor): s for s in sensors_with_picture(history)}
     if (robot, sensor) not in sensors:
         names = ", ".join(map(".".join, sensors)) or "none"
         raise RunError(f"sensor {robot}.{sensor} has no picture in this run, expected one of: {names}")
@@ -193,12 +192,9 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, optio
     expected, single = np.isfinite(s.expected).all(), len(s.expected) == 1
     closed = np.vstack([s.measured, s.measured[:1]]) if len(s.measured) > 2 else s.measured
     rejected, new = s.outcome == "rejected", s.outcome == "new"
-    if not len(s.measured):
-        pass
-    elif single:
-        axes.plot(
-            *s.measured.T, "+", color=options.colour("measured", point), markersize=8, markeredgewidth=1.1, zorder=3
-        )
+    if single:
+        cross = options.colour("measured", point)
+        axes.plot(*s.measured.T, "+", color=cross, markersize=8, markeredgewidth=1.1, zorder=3)
     else:
         thick = options.colour("measured", MEASURED if new else SEGMENT)
         axes.plot(*closed.T, "-", color=thick, linewidth=3.0, alpha=0.55, zorder=2)

@@ -9,7 +9,6 @@ from pathlib import Path
 from kalmark.files import replace_folder, write
 from kalmark.results.evaluate import evaluate
 from kalmark.results.figure_texts import Figures
-from kalmark.results.history import Camera, Measuring
 from kalmark.results.recording import Recording, file_name
 from kalmark.results.scene import picture_of, steps_of
 
@@ -82,12 +81,11 @@ class Run(Recording):
         written = [*(folder / f"map.{ending}" for ending in endings), folder / "report.html"]
         for path in written[:-1]:
             save_map(self, path, world)
-        drawable: list[Camera | Measuring] = [*self.history.cameras, *sensors_with_picture(self.history)]
-        for seen in (sensor for sensor in drawable if len(steps_of(self.history, sensor))):
-            figure, name = (
-                draw_sensor(self, seen.robot, seen.sensor),
-                "_".join(map(file_name, (seen.robot, seen.sensor))),
-            )
+        for seen in sensors_with_picture(self.history):
+            if not len(steps_of(self.history, seen)):
+                continue
+            figure = draw_sensor(self, seen.robot, seen.sensor)
+            name = "_".join(map(file_name, (seen.robot, seen.sensor)))
             dpi = 110 if picture.sensor_width_px is None else picture.sensor_width_px / figure.get_figwidth()
             for ending in endings:
                 written.append(folder / f"sensor_{name}.{ending}")
