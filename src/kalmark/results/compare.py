@@ -15,7 +15,7 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import short_text
 from kalmark.results.evaluate import summary_of
-from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, Figures, column_header, figure
+from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, Figures, column_header, figure, flatten
 from kalmark.results.history import Ints
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.plot import draw_plan, legend
@@ -109,19 +109,10 @@ def _path(run: Recording, robot: str) -> tuple[Ints, Array]:
 
 def _differing(runs: Mapping[str, Recording]) -> dict[str, list[str]]:
     """Return the keys in which configurations differ, and what each has."""
-    flat = [dict(_flat(run.config)) for run in runs.values()]
+    flat = [dict(flatten(run.config)) for run in runs.values()]
     keys = dict.fromkeys(key for each in flat for key in each)
     values = {key: [short_text(each[key]) if key in each else "-" for each in flat] for key in keys}
     return {k: v for k, v in values.items() if k not in OF_ITS_OWN and any(a != b for a, b in pairwise(v))}
-
-
-def _flat(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the keys of a configuration by their paths, and their values."""
-    if isinstance(section, Mapping) and (section or not where):
-        for key, value in section.items():
-            yield from _flat(value, f"{where}.{key}" if where else str(key))
-    else:
-        yield where, section
 
 
 def _said(value: Any) -> str:

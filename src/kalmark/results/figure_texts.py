@@ -24,6 +24,15 @@ TOTALS, MORE, ROBOT, BATCH = (
 )
 
 
+def flatten(section: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested mappings by their paths."""
+    if isinstance(section, Mapping) and (section or not where):
+        for key, value in section.items():
+            yield from flatten(value, f"{where}.{key}" if where else str(key))
+    else:
+        yield where, section
+
+
 def rows_with_labels(figures: Summary, words: Words) -> Iterator[tuple[str, str, Any, str]]:
     """Yield key, label, value and unit of each figure in the order of the words; last, by its key, what has none."""
     known = {key: (label, unit) for key, label, unit in words}

@@ -410,6 +410,10 @@ class History:
         """Return which observations (O,) a sensor of a robot made."""
         return np.asarray((self.observers == robot) & (self.sensor == sensor))
 
+    def reason_begins(self, starts: Iterable[str]) -> Flags:
+        """Return which observations (O,) have a reason that begins with one of these texts."""
+        return np.logical_or.reduce([np.char.startswith(self.reason, start) for start in starts])
+
     @property
     def localizes(self) -> bool:
         """True if each sensor that made observations read its own robot: no landmark is to be expected."""

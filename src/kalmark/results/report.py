@@ -38,6 +38,7 @@ from kalmark.results.figure_texts import (
     Figures,
     column_header,
     difference_rows,
+    flatten,
     rows_with_labels,
 )
 from kalmark.results.filter_description import KEPT
@@ -68,6 +69,7 @@ from kalmark.results.verdict_text import overall, verdict_lines
 
 Data = dict[str, Any]  # of the page, as JSON
 NOT_FIGURES = ("robots", "warnings", "advice", "notes", "gaps", "repeats", "verdict")
+LISTS = (".directions", ".pose_differences")  # with tables of their own
 BINS = 120
 LANDMARKS = 40_000  # in all the maps of a page together
 SCANS = 60  # drawn at most, the most ambiguous ones
@@ -144,7 +146,8 @@ def robot_table(summary: Figures) -> str:
 
 def summary_table(summary: Figures) -> str:
     """Return the table of all other figures in words; the tooltip of each is its key in ``summary.json``."""
-    figures = dict(_flat(summary))
+    told = flatten({key: value for key, value in summary.items() if key not in NOT_FIGURES})
+    figures = {path: value for path, value in told if not path.endswith(LISTS)}
     words = [*TOTALS, *MORE, *((f"batch.{key}", f"batch solution: {label}", unit) for key, label, unit in BATCH)]
     others = [name for name, value in summary.items() if isinstance(value, dict) and "ate_raw_m" in value]
     words += [(f"{name}.{key}", f"{name}: {label}", unit) for name in others for key, label, unit in ROBOT]
@@ -168,15 +171,6 @@ def figure_text(value: Any, unit: str = "") -> str:
     if isinstance(value, list):
         return ", ".join(figure_text(item, unit) for item in value)
     return str(value)
-
-
-def _flat(summary: Figures, prefix: str = "") -> list[tuple[str, Any]]:
-    out: list[tuple[str, Any]] = []
-    for key, value in summary.items():
-        if (key in NOT_FIGURES and not prefix) or key in ("directions", "pose_differences"):
-            continue
-        out += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
-    return out
 
 
 def spans(texts: Iterable[str]) -> str:
@@ -426,7 +420,7 @@ def ambiguous(history: History) -> Ints:
     if not len(history.candidate_row):
         return np.zeros(0, dtype=np.int64)
     doubt = (history.outcome == "deferred").astype(np.int64)
-    doubt += np.logical_or.reduce([np.char.startswith(history.reason, start) for start in UNSURE])
+    doubt += history.reason_begins(UNSURE)
     shown = np.zeros(len(history.step), dtype=np.bool_)
     shown[history.candidate_row] = True
     score = np.bincount(history.step[shown], doubt[shown], len(history.t_ns))

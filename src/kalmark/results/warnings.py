@@ -108,8 +108,7 @@ def left_out_windows(history: History) -> list[Window]:
     """Return the share of observations that were rejected, or ignored because they fit nothing, window by window."""
     mine = history.outcome != "tentative"
     out = np.isin(history.outcome[mine], ["rejected", "ignored", "deferred"]) & (history.d2[mine] > 0)
-    told = [np.char.startswith(history.reason[mine], start) for start in ("between ", "it does not")]
-    wrong = np.logical_or.reduce([out, *told]).astype(np.float64)
+    wrong = (out | history.reason_begins(("between ", "it does not"))[mine]).astype(np.float64)
     return _windows(history, history.step[mine], wrong, np.ones(len(wrong), dtype=np.int64), OBSERVATIONS, WINDOW_SCANS)
 
 
@@ -314,7 +313,7 @@ def _observations(run: Recording, summary: Summary) -> Iterator[str]:
 
 def left_out_by_attention(history: History) -> Flags:
     """Return which observations (O,) an attention left out: that contradicts nothing."""
-    return np.logical_or.reduce([np.char.startswith(history.reason, start) for start in ATTENTION])
+    return history.reason_begins(ATTENTION)
 
 
 def _unused(run: Recording) -> Iterator[str]:
