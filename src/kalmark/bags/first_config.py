@@ -138,7 +138,9 @@ class _Writer:
     def one(self, robot: str, topics: Sequence[TopicSummary], out: _Lines) -> None:
         """Add the lines of one robot."""
         scans = [topic for topic in topics if topic.offers.seen is not None and not self.useless(topic)]
-        control, kind = self.control(robot, topics, not any(map(_in_pixels, scans)))
+        control, kind = self.control(
+            robot, topics, not any(topic.columns[:1] in (("u_px",), ("u1_px",)) for topic in scans)
+        )
         if control is None and not any(topic.columns[:2] == BEAM for topic in scans):
             control, kind = self.inertial(topics)
         space = kind in SPACE if kind else not any(topic.columns[:2] == BEAM for topic in scans)
@@ -329,7 +331,3 @@ def _is_odometry(parent: str, child: str) -> bool:
 
 def _has_frames(topic: TopicSummary) -> bool:
     return topic.offers.transforms is not None and "static" not in topic.name
-
-
-def _in_pixels(topic: TopicSummary) -> bool:
-    return topic.columns[:1] in (("u_px",), ("u1_px",))

@@ -19,11 +19,6 @@ def yaml_text(text: str) -> str:
     return text if plain and text not in ("true", "false", "null", "yes", "no", "on", "off") else f"'{text}'"
 
 
-def yaml_number(value: float) -> str:
-    """Return a number with as many digits as mean something here."""
-    return f"{value:.6g}"
-
-
 def yaml_mapping(values: dict[str, Any]) -> str:
     """Return a mapping on one line of YAML."""
     parts = []
@@ -36,7 +31,7 @@ def yaml_mapping(values: dict[str, Any]) -> str:
             text = "null"
         else:
             words = yaml_text(value) if isinstance(value, str) else str(value)
-            text = yaml_number(value) if isinstance(value, float) else words
+            text = f"{value:.6g}" if isinstance(value, float) else words
         parts.append(f"{key}: {text}")
     return f"{{{', '.join(parts)}}}"
 

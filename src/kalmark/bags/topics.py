@@ -153,10 +153,6 @@ def _microseconds(time: Any) -> int:
     return (nanoseconds_of_text(str(time)) + 500) // 1000
 
 
-def _a_size(value: Any) -> bool:
-    return is_number(value) and 0 < value < 1e3
-
-
 @register("topic", "scan")
 class Scans(Carried):
     """Observations of a sensor: laser beams, points, ranges, detections, corners or poses of tags, markers."""
@@ -187,7 +183,9 @@ class Scans(Carried):
                 raise refuse(self, "take", "a list of columns")
         if self.landmark is not None and (isinstance(self.landmark, bool) or not isinstance(self.landmark, int | str)):
             raise refuse(self, "landmark", "an id")
-        if self.sizes is not None and not (isinstance(self.sizes, Mapping) and all(map(_a_size, self.sizes.values()))):
+        if self.sizes is not None and not (
+            isinstance(self.sizes, Mapping) and all(is_number(size) and 0 < size < 1e3 for size in self.sizes.values())
+        ):
             raise refuse(self, "sizes", "a mapping of ids to lengths in m")
         try:
             self.ignored  # noqa: B018 - what is not a list or a mapping is refused here

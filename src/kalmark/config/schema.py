@@ -264,17 +264,13 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
     if isinstance(start, SpaceStartConfig) and start.at_rest:
         if "bias_ax_mps2" not in has:
             raise unexpected_value(f"false: {motion.type} has no inertial unit", "start", "at_rest")
-        if not np.all(_three(start.sigma_bias_a_mps2)):
+        if not np.all(start.sigma_bias_a_mps2):
             raise unexpected_value("a number > 0: at rest a bias is taken for a tilt", "start", "sigma_bias_a_mps2")
     states = *STATES["plane"], *STATES["space"]
     for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
             what = next((word for word in ("slip", "bias", "gravity") if word in key), "velocity like this")
             raise unexpected_value(f"0: {motion.type} has no {what} in its state", "start", key)
-
-
-def _three(sigma: float | tuple[float, ...]) -> Any:
-    return np.broadcast_to(np.asarray(sigma, dtype=np.float64), 3)
 
 
 BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]

@@ -149,13 +149,6 @@ class Table:
                 raise LogError(f"{told}all {len(size)} numbers are within pi and reach it, expected {wanted}")
 
 
-def open_source(source: Path | Content) -> Content:
-    """Return the content of a source.  Raises LogError if it is missing, empty or none of its kind."""
-    if isinstance(source, Content):
-        return source
-    return _of_parquet(source) if source.suffix == PARQUET else _of_csv(source)
-
-
 def _of_parquet(path: Path) -> Content:
     def parts() -> Iterator[Any]:
         """Yield the names of the columns and the number of rows, then columns of some rows at a time."""
@@ -237,7 +230,10 @@ def read_table(
     positions on a `globe` are taken for x_m, y_m and z_m, if one is given.  Raises LogError if the source is missing or
     empty, or has a header that does not fit.
     """
-    content = open_source(source)
+    if isinstance(source, Content):
+        content = source
+    else:
+        content = _of_parquet(source) if source.suffix == PARQUET else _of_csv(source)
     where, known = content.where, (*required, *(allowed or ()), *known)
     header, given, unit_ns = header_in_units(content.header, known)
     on_globe = globe is not None and any(name in header for name in ("lat_deg", "lon_deg"))

@@ -24,11 +24,11 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from kalmark.declare import load_plugin
-from kalmark.errors import RunError
+from kalmark.errors import LogError, RunError
 from kalmark.events import fixed_seconds, list_names, short_text
-from kalmark.files import csv_text, hold_lock, read_arrays, refuse_aliases, replace_file, write
+from kalmark.files import csv_text, hold_lock, read_arrays, replace_file, write
 from kalmark.logs.poses import tum_text
-from kalmark.logs.source import LeftOut, records_of
+from kalmark.logs.source import LeftOut, read_mapping, records_of
 from kalmark.results.figure_texts import Figures
 from kalmark.results.history import History, ints
 from kalmark.results.landmark_table import MapLandmarks
@@ -108,15 +108,6 @@ def config_yaml(config: Section) -> str:
     yaml.representer.add_representer(type(None), lambda to, _: to.represent_scalar("tag:yaml.org,2002:null", "null"))
     yaml.dump(plain_value(head | {key: value for key, value in config.items() if key not in head}), out)
     return out.getvalue()
-
-
-def read_yaml(path: Path) -> Section:
-    """Read a saved configuration.  Raises RunError if it is not a mapping."""
-    config = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-    refuse_aliases(config, str(path), RunError)
-    if not isinstance(config, dict):
-        raise RunError(f"{path}: got {type(config).__name__}, expected a mapping of keys")
-    return config
 
 
 def file_name(robot: str) -> str:
@@ -248,7 +239,7 @@ class Recording:
                 log = summary["log"]
                 return cls(
                     history=History.from_arrays(named),
-                    config=read_yaml(folder / "config.yaml"),
+                    config=read_mapping(folder / "config.yaml"),
                     landmarks=MapLandmarks.read(folder / "landmarks.csv"),
                     truth=Truth.from_arrays(named),
                     log=LogReference(**log | {"robots": tuple(log["robots"])}),
@@ -265,7 +256,7 @@ class Recording:
                     summary=summary,
                     reference={name: summary[name] for name in named["reference"].tolist()},
                 )
-        except (KeyError, ValueError, OSError) as error:
+        except (KeyError, ValueError, OSError, LogError) as error:
             raise RunError(f"{folder}: not a run that this version reads: {error}") from None
 
     def save_files(self, folder: Path) -> None:

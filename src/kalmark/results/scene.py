@@ -421,7 +421,7 @@ def images(history: History, camera: Camera, step: int) -> list[Image]:
     for row in np.flatnonzero(history.step == step):
         name, outcome = str(history.landmark[row]) or str(history.id[row]), str(history.outcome[row])
         named = name, outcome, str(history.kind[row]) in EUCLIDEAN
-        _add_sighting(found, points, named, history.e[row], history.Z[row], history.y[row], history.z[row])
+        _add_sighting(found, points, named, history.e[row], history.Z[row], (history.y[row], history.z[row]))
     for row in np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == camera.sensor)):
         named = str(history.unmeasured_landmark[row]), IN_VIEW, str(history.unmeasured_kind[row]) in EUCLIDEAN
         _add_sighting(found, points, named, history.unmeasured_e[row], history.unmeasured_Z[row])
@@ -440,19 +440,22 @@ def images_of_report(camera: Camera, report: Report, kinds: Sequence[str]) -> li
     for o, kind in zip(report.observations, kinds, strict=True):
         name, k = next((str(each) for each in (o.landmark, o.id) if each is not None), ""), o.index
         named = name, o.outcome, kind in EUCLIDEAN
-        _add_sighting(found, points, named, report.e[k], report.Z[k], report.y[k], report.z[k])
+        _add_sighting(found, points, named, report.e[k], report.Z[k], (report.y[k], report.z[k]))
     return found
 
 
 def _add_sighting(
     found: list[Image], points: Mapping[str, Ints], named: tuple[str, str, bool], e: Array, Z: Array,
-    y: Array | None = None, z: Array | None = None,
+    measured: tuple[Array, Array] | None = None,
 ) -> None:  # fmt: skip
-    """Add to its images an observation, or what was not measured: its name, outcome and whether it is Euclidean."""
-    whole = y is None or z is None or np.isfinite(z).sum() == np.isfinite(y).sum()
+    """Add what was expected, e and Z, to its images, and what was `measured`: y and z.
+
+    It is `named` by its name, its outcome and whether it is Euclidean.
+    """
+    whole = measured is None or len({np.isfinite(numbers).sum() for numbers in measured}) == 1
     for image, at in zip(found, points.values(), strict=True):
         Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
-        image.sightings.append(Sighting(*named, np.empty((0, 2)) if y is None else y[at], e[at], Z_at))
+        image.sightings.append(Sighting(*named, np.empty((0, 2)) if measured is None else measured[0][at], e[at], Z_at))
 
 
 def colour_of(sighting: Sighting, picture: Picture) -> tuple[str, str]:
