@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from kalmark.arrays import Array
 from kalmark.bags.configured_topics import sensor_name
 from kalmark.bags.first_words import GUESS, yaml_mapping
 from kalmark.bags.survey import Survey, TopicSummary
 from kalmark.bags.topics import Scans
 from kalmark.geometry.named_poses import describe_pose
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.logs.table_columns import BEAM, CORNERS, POSE3, POSITION
 
 CAMERA = {"fx_px": 600.0, "fy_px": 600.0, "cx_px": 640.0, "cy_px": 512.0, "width_px": 1280, "height_px": 1024}
@@ -46,7 +45,7 @@ def section_line(found: Survey, topic: TopicSummary, control: Any, space: bool) 
     mount = mount_of(found, topic, control)
     section, why = sensor_section(found, topic, space)
     if mount is None:
-        section["mount"] = dict.fromkeys(describe_pose(np.array([0.0] * 6 + [1.0])), 0.0) if space else {
+        section["mount"] = dict.fromkeys(describe_pose(ORIGIN[7]), 0.0) if space else {
             "x_m": 0.0, "y_m": 0.0, "theta_rad": 0.0}  # fmt: skip
         why = f"{why}; {GUESS} the mount: tf does not have {topic.frame or 'its frame'}".removeprefix("; ")
     else:

@@ -13,6 +13,7 @@ from kalmark.arrays import Array
 from kalmark.bags import tables, view
 from kalmark.bags.mcap_writer import Outgoing, header_fields, write_mcap
 from kalmark.geometry.named_poses import pose_of
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import matrix
 from kalmark.results.history import MapSnapshot
 from kalmark.results.landmark_table import shapes
@@ -109,7 +110,7 @@ def landmark_markers(kept: MapSnapshot) -> list[dict[str, Any]]:
             out.append(view.label(t_ns, number, str(kept.ids[row]), mean, colour))
     for number, ends in enumerate(drawn.lines):
         if np.isfinite(ends).all():
-            here = view.pose_fields(np.array([0.0, 0, 0, 0, 0, 0, 1]))
+            here = view.pose_fields(ORIGIN[7])
             one = view.marker(t_ns, "lines", number, view.LINES, here, (view.THIN_M, 0, 0), colour)
             out.append(one | {"points": [dict(zip("xyz", end.tolist(), strict=True)) for end in ends]})
     for number, pose in enumerate(drawn.tags):

@@ -22,8 +22,9 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, sort_key, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import matrix
-from kalmark.logs.camera_calibration import lens
+from kalmark.logs.camera_calibration import INTRINSICS, lens
 from kalmark.logs.known_map import TAG, KnownLandmark
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import (
@@ -43,7 +44,6 @@ MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_
 VELOCITY = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
 MOUNT_SIGMAS = {"sigma_position_m": 0.05, "sigma_rotation_deg": 3.0}  # of a camera whose pose is not given
 MAX_HAMMING = 2
-HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
 SIGMA = 0.005
 """Of odometry, m and rad per square root of a second, where none is given: that of test 21 is 0.003."""
 LATE_NS = 1_000_000_000
@@ -155,7 +155,7 @@ def read_cameras(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Arr
 def described_camera(camera: dict[str, Any], mount: dict[str, float], pixel_noise: float) -> dict[str, Any]:
     """Return the section of one camera that sees tags."""
     section: dict[str, Any] = {"type": "tag_corners"}
-    section |= dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), map(float, camera["intrinsics"]), strict=True))
+    section |= dict(zip(INTRINSICS, map(float, camera["intrinsics"]), strict=True))
     section |= dict(zip(("width_px", "height_px"), map(int, camera["resolution"]), strict=True))
     section |= lens(camera["distortion_model"], camera["distortion_coeffs"])
     return section | {"sigma_px": pixel_noise, "mount": mount}
@@ -244,7 +244,7 @@ def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
         return Reference(None, {}, {})
     world = scene.default_body if scene.static.get(rig) and not scene.static.get(scene.default_body, True) else "map"
     moving = rig if world == "map" else world
-    last: dict[tuple[str, str], Array] = {("map", "map"): HERE}
+    last: dict[tuple[str, str], Array] = {("map", "map"): ORIGIN[7]}
     track: list[tuple[int, Array]] = []
     for topic, message in messages_of_bag(bag):
         if topic == f"/tagslam/odom/body_{moving}":

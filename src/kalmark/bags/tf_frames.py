@@ -10,6 +10,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.bags.messages import Transform
 from kalmark.geometry.frames3d import compose, inverse
+from kalmark.geometry.pose_frames import ORIGIN
 
 BASES = ("base_link", "base_footprint")
 STILL = 1e-6
@@ -36,7 +37,7 @@ class Frames:
     def fixed(self, parent: str, child: str) -> Array | None:
         """Return the frame `child` (7,) in the frame `parent`, None if it is not known or moves."""
         parent, child = parent.lstrip("/"), child.lstrip("/")
-        found: dict[str, Array] = {parent: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+        found: dict[str, Array] = {parent: ORIGIN[7]}
         waiting = deque([parent])
         while waiting:
             here = waiting.popleft()

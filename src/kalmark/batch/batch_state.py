@@ -23,7 +23,6 @@ Ints = Index
 
 POSES, LANDMARKS, FIRST_MOUNT = range(3)  # the first two groups; from the third on each group is one mount
 POSE_SPACES: dict[int, Space] = {3: SE2, 7: SE3}  # by their numbers
-ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 
 
 def unsolvable_problem(what: str) -> KalmarkError:

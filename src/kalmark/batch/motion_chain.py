@@ -10,10 +10,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import ORIGIN, Ints, unsolvable_problem
+from kalmark.batch.batch_state import Ints, unsolvable_problem
 from kalmark.batch.problem import Motions, motions
 from kalmark.events import Control
 from kalmark.geometry import frames, frames3d
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.models.observe import sensor_pose
 from kalmark.models.protocols import Motion, SelfCalibrating, self_calibrating, true_control
 from kalmark.slam.held_control import HeldInput, MotionPart

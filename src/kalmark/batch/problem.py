@@ -17,7 +17,6 @@ import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import (
-    ORIGIN,
     POSE_SPACES,
     POSES,
     BatchState,
@@ -27,6 +26,7 @@ from kalmark.batch.batch_state import (
     step_residuals,
 )
 from kalmark.events import Id
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.spaces import POINT2, POINT3, Space
 
 DIFFERENCE = 1e-5  # m and rad

@@ -10,6 +10,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import KalmarkError, MapError
 from kalmark.events import Fix, Id, Scan, short_text
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.logs.log import Log, begins_at, poses_of_size
 from kalmark.picture_options import Picture
 from kalmark.report import Report
@@ -18,7 +19,7 @@ from kalmark.results.history import RobotStart
 from kalmark.results.landmark_table import MapLandmarks, shapes
 from kalmark.results.measures import Rigid
 from kalmark.results.scene import Ray, Scene, Way, drawn_box, places_of
-from kalmark.results.truth import ORIGIN, as_rigid, frame_offset, landmarks_of_size, move_landmarks
+from kalmark.results.truth import as_rigid, frame_offset, landmarks_of_size, move_landmarks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,13 +11,13 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.events import Id
 from kalmark.geometry.angles import wrap
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import from_matrix, matrix
 from kalmark.logs.log import Log, PositionTrack, poses_of_size
 from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, ints, padded_all, texts
 from kalmark.results.landmark_table import TAG
 from kalmark.results.measures import Rigid, pose_error, sigmas
 
-ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 SAME_FRAME_M, SAME_FRAME_RAD, SAME_FRAME_SIGMAS = 0.05, 0.02, 4.0
 
 

@@ -10,6 +10,7 @@ from kalmark.arrays import Array
 from kalmark.errors import MapError
 from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Correction, Update
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.observe import view_of
 from kalmark.models.sensors import Gps2D, Gps3D
@@ -21,7 +22,6 @@ from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.reader import StateReader
 from kalmark.slam.state import State
 
-ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 ANTENNAS = {2: Gps2D(), 3: Gps3D()}  # a fix is a reading of one
 FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes stay within
 

@@ -15,6 +15,7 @@ import numpy as np
 from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera_log, camera_section
 from kalmark.declare import Within
 from kalmark.errors import LogError
+from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.image_files import DEPTH_SCALE, frames_of
 from kalmark.logs.log import Log
 from kalmark.logs.poses import read_path
@@ -62,9 +63,7 @@ def published_calibration(name: str) -> dict[str, Any]:
     if series is None:
         return {}
     k, d = PUBLISHED[series[1]]
-    return (
-        dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), k, strict=True)) | SIZE | {"lens": "radtan", "distortion": [*d]}
-    )
+    return dict(zip(INTRINSICS, k, strict=True)) | SIZE | {"lens": "radtan", "distortion": [*d]}
 
 
 def read_list(file: Path) -> dict[int, Path]:
