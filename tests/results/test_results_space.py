@@ -12,6 +12,7 @@ import pytest
 import kalmark as km
 from kalmark.geometry import SE3
 from kalmark.geometry.frames3d import compose
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import exp, left_jacobian_inverse, log, multiply
 from kalmark.geometry.spaces import RHO, VECTOR3, Space, retract
 from kalmark.logs.log import poses_of_size
@@ -22,7 +23,7 @@ from kalmark.results.measures import point_error, pose_error, rotation_error
 from kalmark.results.record import record
 from kalmark.results.recording import tum
 from kalmark.results.run import Run
-from kalmark.results.truth import ORIGIN, Truth
+from kalmark.results.truth import Truth
 from results_space import START, slam_for, spiral
 
 
