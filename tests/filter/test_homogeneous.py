@@ -23,7 +23,7 @@ def moved(estimator: km.estimators.Invariant | km.estimators.Ekf) -> StochasticM
     N, none = np.diag([SIGMA_M**2] * 3 + [0.0] * 3), np.zeros((0, 0))
     model, u = step_of(km.motion.Odometry3D()), np.array([0.1, 0, 0, 0, 0, 0])
     for _ in range(STEPS):
-        assert estimator.predict(m, Movement(model, robot, (), False, np.zeros((6, 0)), u, N, none, 1.0))
+        assert estimator.predict(m, Movement(model, robot, (), False, False, np.zeros((6, 0)), u, N, none, 1.0))
     return m
 
 

@@ -42,7 +42,7 @@ from kalmark.slam.slam import Slam
 
 PREDICT = signature_of(
     "b1(Tuple((f8[::1], f8[::1], f8[:, ::1], i8, i8[:, ::1], i8[:, ::1], i8)), "
-    "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1, b1)"
+    "Tuple((Tuple((i8, f8[::1])), i8, i8[::1], b1, b1, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8)), b1, b1)"
 )
 CORRECT = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[::1], b1[::1], b1))({corrections.TO_CORRECT}, Tuple((i8, f8)))"
@@ -219,7 +219,7 @@ def filter_run(
         n = 3 + 2 * count
         D = density * dt_s[k] if len(density) and u[k].any() else nothing
         map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
-        ok = call_predict(ways[0], (map_, (motion, robot, none, never, no_effect, u[k], N, D, dt_s[k]), never, never))
+        ok = call_predict(ways[0], (map_, (motion, robot, none, never, never, no_effect, u[k], N, D, dt_s[k]), never, never))
         if ok and middle > low:
             whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines
             known = slots[low:middle]

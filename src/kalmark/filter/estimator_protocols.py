@@ -39,12 +39,13 @@ class Movement(NamedTuple):
     """One part of a robot's motion: the control u (m,), held for `dt_s` seconds, with the covariance N of its error.
 
     `model` is the motion, compiled (a tuple) or in Python; `added` are the slots of constant blocks that change the
-    control: their numbers (c,), one after the other, add B (m, c) times them to it.  One has its error where that is
-    `shared` with other parts.  D is the noise gathered in the robot's frame, (0, 0) for none.
+    control: their numbers (c,), one after the other, add B (m, c) times them to it.  The first has its error (m,) where
+    that is `shared` with other parts; where it `begins`, it is 0 with the covariance N, whatever it was before.  D is
+    the noise gathered in the robot's frame, (0, 0) for none.
 
     >>> rover = km.motion.Unicycle()
     >>> u = np.array([0.5, 0.1])
-    >>> one = Movement(rover, 0, [], False, np.zeros((2, 0)), u, rover.control_noise(u), np.zeros((0, 0)), dt_s=0.1)
+    >>> one = Movement(rover, 0, [], False, False, np.zeros((2, 0)), u, rover.control_noise(u), np.zeros((0, 0)), dt_s=0.1)
     >>> one.model.move(np.zeros(3), one.u, one.dt_s)[0].round(3)
     array([0.05, 0.  , 0.01])
     """
@@ -53,6 +54,7 @@ class Movement(NamedTuple):
     robot: int
     added: Sequence[int]
     shared: bool
+    begins: bool
     B: Array
     u: Array
     N: Array

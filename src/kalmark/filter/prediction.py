@@ -19,7 +19,7 @@ from kalmark.geometry.spaces import HOMOGENEOUS, KIND, P_AT, Table
 from kalmark.models.observe import step
 
 Map = tuple[Array, Array, Array, int, Table, Table, int]  # x, x_first, P, n, blocks, atoms, the generator's address
-Motion = tuple[Any, int, Index, bool, Array, Array, Array, Array, float]  # as `estimators.Movement`
+Motion = tuple[Any, int, Index, bool, bool, Array, Array, Array, Array, float]  # as `estimators.Movement`
 
 
 @compiled
@@ -41,21 +41,30 @@ def noise_in_world(state: Array, D: Array) -> Array:
 
 
 @compiled
-def append_constants(F: Array, R_a: Array, Q: Array, shared: bool) -> tuple[Array, Array]:
+def append_constants(
+    F: Array, R_a: Array, R_u: Array, N: Array, Q: Array, shared: bool, begins: bool
+) -> tuple[Array, Array]:
     """Return F and Q (n + c, .) of a robot and the constants that change its control, R_a (n, c) by these.
 
-    With a `shared` error the control's noise is among the constants.
+    With a `shared` error the control's noise is that of the first of them, which `begins` or goes on.
     """
-    n, c = R_a.shape
+    (n, c), m = R_a.shape, len(N) if begins else 0
     size = n + c
     F_all, Q_all = np.eye(size), np.zeros((size, size))
     for i in range(n):
         for j in range(n):
             F_all[i, j] = F[i, j]
-            if not shared:
+            if begins or not shared:
                 Q_all[i, j] = Q[i, j]
-        for j in range(c):
+        for j in range(m, c):
             F_all[i, n + j] = R_a[i, j]
+    R_N = kernels.product(R_u, N)
+    for j in range(m):
+        F_all[n + j, n + j] = 0.0
+        for i in range(n):
+            Q_all[i, n + j] = Q_all[n + j, i] = R_N[i, j]
+        for i in range(m):
+            Q_all[n + i, n + j] = N[i, j]
     return F_all, Q_all
 
 
@@ -101,7 +110,7 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     `spreads`: with the mean square of what the noise does to homogeneous points, `spread_rays`.
     """
     x, x_first, P, n, blocks, atoms, turns = map_
-    model, robot, added, shared, B, u, N, D, dt_s = motion
+    model, robot, added, shared, begins, B, u, N, D, dt_s = motion
     at, size, p_at, dof = blocks[robot, 0], blocks[robot, 1], blocks[robot, 2], blocks[robot, 3]
     index, total, c = np.empty(dof + B.shape[1], np.int64), u.copy(), 0
     for i in range(dof):
@@ -110,7 +119,7 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
         for j in range(blocks[added[b], 1]):
             index[dof + c] = blocks[added[b], 2] + j
             for i in range(len(u)):
-                total[i] += B[i, c] * x[blocks[added[b], 0] + j]
+                total[i] += B[i, c] * x[blocks[added[b], 0] + j] if b > 0 or not begins else 0.0
             c += 1
     r = x[at : at + size].copy()
     moved, F, R_u = step(model, r, total, dt_s)  # [S] (14)
@@ -122,7 +131,7 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     Q, valid = kernels.moved_noise(moved, F, R_u, N)  # the last term of [S] (15)
     if not valid:
         return False
-    F, Q = append_constants(F, kernels.product(R_u, B), Q, shared)
+    F, Q = append_constants(F, kernels.product(R_u, B), R_u, N, Q, shared, begins)
     if len(D):
         Q_D = noise_in_world(moved, D)
         for i in range(len(D)):
@@ -133,6 +142,8 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
         spread_rays(P, atoms, Q)
     for i in range(size):
         x[at + i] = x_first[at + i] = moved[i]
+    for i in range(len(u) if begins else 0):
+        x[blocks[added[0], 0] + i] = x_first[blocks[added[0], 0] + i] = 0.0
     return True
 
 

@@ -238,15 +238,18 @@ class Textbook:
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (9)-(10)."""
-        model, robot, added, shared, B, u, N, D, dt_s = movement
+        model, robot, added, shared, begins, B, u, N, D, dt_s = movement
         m, robot, _, slots = map_.movable(robot, added)
         size, c, d = len(m.index(robot)), len(u), len(D)
         book, order = self._opened(m, [robot, *slots.tolist()])  # what changes the control is behind the robot's own
+        error = np.arange(size, size + c if begins else size)  # what was there before has no effect
+        book.x[error] = 0.0
         r, R_r, R_u = step(model, book.x[:size], u + B @ book.x[size : book.m], dt_s)
         F_r, F_n, Q = np.eye(book.m), np.zeros((book.m, c + d)), np.zeros((c + d, c + d))
         F_r[:size, :size], F_r[:size, size:] = R_r, R_u @ B
         F_n[:size, :c], F_n[:d, c:] = R_u, np.eye(d)
-        Q[:c, :c] = 0.0 if shared else N
+        F_r[:, error], F_n[error, : len(error)] = 0.0, np.eye(len(error))
+        Q[:c, :c] = 0.0 if shared and not begins else N
         Q[c:, c:] = noise_in_world(r, D) if d else D
         book.Q, book.move = Q, lambda x, _u, _n: (np.concatenate([r, x[size:]]), F_r, F_n)
         book.predict(u)

@@ -46,7 +46,7 @@ MOST, CHANGED = 30, 4.0  # controls in their mean, and sigmas by which noise alo
 class MotionPart(NamedTuple):
     """One piece of motion: the control, the covariance N of its error, and its duration.
 
-    `first` and `last`: whether it begins and ends its control's interval: if not both, the error is shared.
+    `first` and `last`: whether it begins and ends its control's interval.
     `unknown` (dof, dof) is the covariance of what the robot may have moved besides, without a control.  `usual` is the
     mean of earlier controls like it, None where no constants of controls are in the map.
     """
@@ -58,6 +58,11 @@ class MotionPart(NamedTuple):
     last: bool
     unknown: Array | None = None
     usual: Array | None = None
+
+    @property
+    def shares(self) -> bool:
+        """True if other parts of its control's interval have the same error."""
+        return not (self.first and self.last) and bool(self.N.any())
 
 
 class RateMean(NamedTuple):
@@ -247,7 +252,8 @@ class HeldInput:
 class Moving:
     """A robot in the map: its motion, its slot, the control it holds.
 
-    `bias` and `error` are the slots of the constants of its controls and of a shared error, None where there is none.
+    `bias` and `error` are the slots of the constants of its controls and of the error that parts of a control share,
+    None where there is none.
     `left_out` are the last fixes, if they were outside the gate.
     """
 
@@ -269,15 +275,16 @@ class Moving:
         """The motion as the filter takes it."""
         return step_of(self.motion)
 
-    def added(self, map_: Map, part: MotionPart) -> tuple[list[int], Array, Array]:
+    def added(self, map_: Map, part: MotionPart, shared: bool) -> tuple[list[int], Array, Array]:
         """Return the slots of the blocks that change a control, how, B (m, c) by their numbers b, and u with u + B b.
 
-        That holds at the means of the constants, and B is that of the control as it usually is.
+        That holds at the means of the constants, and B is that of the control as it usually is.  The first is the error
+        of the control where that is `shared`.
         """
-        if self.error is None and self.bias is None:
+        if not shared and self.bias is None:
             return [], no_effect(len(part.u)), part.u
         slots, columns, u = [], [], part.u
-        if self.error is not None:
+        if shared and self.error is not None:
             slots, columns = [self.error], [identity_effect(len(u))]
         if self.bias is not None and isinstance(self.motion, SelfCalibrating):
             a = map_.mean(self.bias)
@@ -291,13 +298,17 @@ class Moving:
         """Return whether parts of its controls, one after the other, lead to finite places, with finite covariances."""
         r = map_.mean(self.slot)
         for part in parts:
-            slots, B, u = self.added(map_, part)
+            slots, B, u = self.added(map_, part, self._shares(part) and not part.first)
             u = u + (B @ np.concatenate([map_.mean(block) for block in slots]) if slots else 0.0)
             moved = step(self.model, r, u, part.dt_s)
             if not moved_noise(*moved, part.N)[1]:
                 return False
             r = moved[0]
         return True
+
+    def _shares(self, part: MotionPart) -> bool:
+        """Return whether the error of a part is a block of the map, which has that of other parts, too."""
+        return self.error is not None and part.shares
 
     def _diffusion(self, map_: Map, part: MotionPart) -> Array | None:
         motion: Any = self.motion
@@ -310,8 +321,10 @@ class Moving:
         D = self._diffusion(map_, part)
         if part.unknown is not None:
             D = part.unknown if D is None else part.unknown + D
-        shared, (slots, B, u) = self.error is not None, self.added(map_, part)
-        return Movement(self.model, self.slot, slots, shared, B, u, part.N, NO_NOISE if D is None else D, part.dt_s)
+        shared = self._shares(part)
+        slots, B, u = self.added(map_, part, shared)
+        noise = part.N, NO_NOISE if D is None else D
+        return Movement(self.model, self.slot, slots, shared, shared and part.first, B, u, *noise, part.dt_s)
 
 
 def bias_name(robot: str) -> str:

@@ -54,8 +54,7 @@ def move(state: State, name: str, part: MotionPart) -> None:
     moving = state.moving[name]
     if not isinstance(moving.model, tuple):  # a user's: nothing is known of it
         refuse_nowhere(state, name, [part])
-    shared = moving.error is None and not (part.first and part.last) and part.N.any()
-    if shared and moving.leads_somewhere(state.map, [part]):
+    if moving.error is None and part.shares and moving.leads_somewhere(state.map, [part]):
         with suppress(MapError):  # it is full: each part has an error of its own
             moving.error = state.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
     if not state.estimator.predict(state.map, moving.movement(state.map, part)):

@@ -193,9 +193,6 @@ class Slam(Estimate):
                 moves.refuse_nowhere(state, event.robot, parts)
             for part in parts:
                 moves.move(state, event.robot, part)
-        if moving.error is not None:  # of a control that is no longer held
-            state.map.remove(moving.error)
-            moving.error = None
         report.gaps = moving.held.noticed()
         return report
 

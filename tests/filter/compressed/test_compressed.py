@@ -339,11 +339,21 @@ def test_in_a_map_too_full_for_the_error_of_a_control_the_robot_drives_on(monkey
 
     for t in range(10):
         slam.process(km.Control(t, "r", (1.0, 0.0)))
-        if t == 5:
-            monkeypatch.setattr(slam.map, "add", full)
-        slam.process(km.Scan(t + 0.5, "r", "l", [], []))  # within the control's interval: both parts have one error
+        monkeypatch.setattr(slam.map, "add", full)
+        slam.process(km.Scan(t + 0.5, "r", "l", [], []))  # within the control's interval: both parts had one error
     assert slam.mean("r")[0] == pytest.approx(9.5)
-    assert slam.covariance("r")[0, 0] == pytest.approx(0.05**2 * (5 + 4 * 0.5 + 0.25))
+    assert slam.covariance("r")[0, 0] == pytest.approx(0.05**2 * (9 * 0.5 + 0.25))
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+@pytest.mark.parametrize("estimator", [km.estimators.Invariant(), km.estimators.Textbook()])
+def test_the_parts_of_a_control_share_an_error_that_begins_anew_with_the_next(map_: str, estimator: Any) -> None:
+    lidar = km.Mount(km.sensors.RangeBearing(0.1, 0.02))
+    slam = km.Slam(km.Robot("r", km.motion.Unicycle(0.05, 0.02), sensors={"l": lidar}), None, estimator, map=map_)
+    for t in range(10):
+        slam.process(km.Control(t, "r", (1.0, 0.0)))
+        slam.process(km.Scan(t + 0.5, "r", "l", [[2.0, 0.3]], [t]))
+    assert slam.covariance("r")[0, 0] == pytest.approx(0.05**2 * (9 + 0.25))
 
 
 def test_float32_keeps_what_is_inactive_to_its_precision_in_half_the_memory() -> None:
