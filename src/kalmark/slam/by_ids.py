@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import cast
 
+import numpy as np
+
 from kalmark.events import Id, Scan
 from kalmark.filter.estimators import Update
 from kalmark.report import JudgedScan, Report
@@ -46,7 +48,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     report.e, report.z, report.Z, _, fused, _ = done
     for track, used in zip(seen, fused.tolist(), strict=True):
         track.observations += used
-    if policy.contests and not fused.all():
+    if policy.contests and np.count_nonzero(fused) < len(fused):
         group = JudgedScan(range(len(ids)), ids, ids, done, channel.gate)
         tentative.contest(state, scan, model, group, elsewhere.misfits(state, scan, done), policy.upkeep.odds)
     if report.gaps and fused.any():

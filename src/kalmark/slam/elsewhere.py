@@ -102,6 +102,8 @@ def correct(
 
 def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> list[int]:
     """Return the observations beyond a limit, and those of things that cannot be seen from here."""
+    if np.count_nonzero(done.fused) == len(done.fused):
+        return []
     far = np.flatnonzero(~done.fused & ~(done.d2 <= limit)).tolist()
     if not far:
         return []

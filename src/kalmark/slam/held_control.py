@@ -62,7 +62,7 @@ class MotionPart(NamedTuple):
     @property
     def shares(self) -> bool:
         """True if other parts of its control's interval have the same error."""
-        return not (self.first and self.last) and bool(self.N.any())
+        return not (self.first and self.last)
 
 
 class RateMean(NamedTuple):
