@@ -219,7 +219,8 @@ def filter_run(
         n = 3 + 2 * count
         D = density * dt_s[k] if len(density) and u[k].any() else nothing
         map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
-        ok = call_predict(ways[0], (map_, (motion, robot, none, never, never, no_effect, u[k], N, D, dt_s[k]), never, never))
+        part = motion, robot, none, never, never, no_effect, u[k], N, D, dt_s[k]
+        ok = call_predict(ways[0], (map_, part, never, never))
         if ok and middle > low:
             whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines
             known = slots[low:middle]

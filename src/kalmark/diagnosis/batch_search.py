@@ -16,8 +16,9 @@ from kalmark.diagnosis import repeated_events
 from kalmark.diagnosis.cause_search import Search
 from kalmark.diagnosis.error_columns import Where
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.trials import fit_of_run
+from kalmark.diagnosis.trials import filter_events, fit_of_run
 from kalmark.errors import KalmarkError
+from kalmark.events import Control, Event
 from kalmark.logs.log import Log
 from kalmark.models.protocols import Calibrated
 from kalmark.models.sensors import Wall
@@ -33,6 +34,7 @@ SEGMENT = 30  # successive scans of each robot that are taken together where not
 MORE = 4  # times as many are taken if the segments do not determine the map, up to `MOST` at the end of a run
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
 LOOKED_INTO = 3  # segments with the worst scans
+WIDER = 20.0  # times the noise of its controls with which a run is filtered again that does not fit
 
 
 class Searched(NamedTuple):
@@ -62,6 +64,33 @@ def search_causes(run: Run, log: Log, most: int, limit: int, progress: bool) -> 
     search = Search(Linear.of(problem, batch.state, gated_noise_factors(run)), sensors_of(run), given.t_ns)
     search.run(progress)
     return Searched(search, batch, given)
+
+
+def associated(run: Run, log: Log) -> Run:
+    """Return a run, or one of less certain controls if in that more observations are of landmarks, and fit better.
+
+    What its controls do not say makes a filter that is too sure of them take landmarks for new ones, and leave others
+    out: then nothing of it is left in the residuals.  The batch problem has the noise that is stated.
+    """
+    robots, before = run.final_slam().robots, fit_of_run(run)
+    if not run.config.get("robots"):
+        return run
+
+    def widened(e: Event) -> Event:
+        if not isinstance(e, Control):
+            return e
+        N = robots[e.robot].motion.control_noise(e.u / e.share) if e.cov is None else e.cov
+        return replace(e, cov=WIDER**2 * N)
+
+    wide = filter_events(run.config, log, [widened(e) for e in log.events])
+    if wide is None or fit_of_run(wide).mean >= before.mean or number_associated(wide) <= number_associated(run):
+        return run
+    return wide
+
+
+def number_associated(run: Run) -> int:
+    """Return how many observations of a run are of landmarks in its map."""
+    return int((run.history.outcome == "associated").sum())
 
 
 def remove_copies(run: Run, given: BatchInput) -> BatchInput:

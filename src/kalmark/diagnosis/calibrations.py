@@ -15,8 +15,7 @@ from kalmark.batch.data import BatchInput
 from kalmark.batch.problem import sightings
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
-from kalmark.diagnosis.cause_search import LEAST_GAIN
-from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.causes import LEAST_GAIN, Finding
 from kalmark.diagnosis.error_columns import MOST_SCALE, Column, columns_of, rates_of
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.tunable_keys import Keys, Path_

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from kalmark.diagnosis import causes
-from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.causes import LEAST_GAIN, Finding
 from kalmark.diagnosis.error_columns import Where, columns_of, errors_of_all_sensors, rates_of
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.turned_mounts import find_turned_mounts
+from kalmark.diagnosis.onsets import find_onsets
 from kalmark.logs.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
@@ -21,7 +21,6 @@ ROUNDS, MORE = 6, 14  # in which all that is sure is taken out, and further ones
 SHARE = (
     0.01  # of all that was explained: a log with many causes comes back to some of them, and more rounds are used up
 )
-LEAST_GAIN = 8.0
 TAKEN_UP, ALIKE = 0.5, 0.85
 MOST_CONDITION = 1e6  # of the information on errors of one column, as correlations
 ORDER = ("steering_offset", "mount_position", "odometry_scale", "odometry_turn", "odometry_offset")
@@ -95,7 +94,7 @@ class Search:
         for n in track(range(rounds), "causes, one after the other", rounds, show=progress):
             candidates = self.candidates()
             least = max(LEAST_GAIN, SHARE * sum(f.gain for f in self.found) if n >= ROUNDS else 0.0)
-            sure = [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > least]
+            sure = self._sure(candidates, least)
             harmful = [] if lasting else [f for f in sure if not f.overstated]
             lasting = lasting or (not harmful and bool(self.correlated()))
             if not sure or (lasting and not any(f.overstated for f in sure)):
@@ -137,15 +136,21 @@ class Search:
     def candidates(self) -> list[Finding]:
         """Return all that may explain what is left."""
         columns = columns_of(self.linear, self.sensors, self.rates)
-        return [
+        found = [
             *causes.systematic(self.linear, [*columns, *errors_of_all_sensors(columns)]),
             *causes.noise(self.linear, self.simulated, self.sensors),
             *causes.outliers(self.linear, self.t_s),
             *causes.moving_landmarks(self.linear, self.t_s),
             *causes.jumps(self.linear, self.t_s),
             *causes.priors(self.linear, self.t_s),
-            *find_turned_mounts(self.linear, self.t_s),
         ]
+        if any(not f.overstated for f in self._sure(found, LEAST_GAIN)):  # else no part of it can be off
+            found += find_onsets(self.linear, columns, self.t_s)
+        return found
+
+    def _sure(self, candidates: list[Finding], least: float) -> list[Finding]:
+        """Return the candidates that are surely not by chance, of more than the least gain."""
+        return [f for f in candidates if f.p * len(candidates) < ALPHA and f.gain > least]
 
     def take(self, finding: Finding) -> None:
         """Take a cause out of the data."""
@@ -153,13 +158,17 @@ class Search:
             self.linear = self.linear.without(finding.Z * finding.value, finding.W * finding.value)
             if finding.errors is not None:
                 self._scale(finding)
-            else:
+            elif finding.is_steady:
                 finding = self._beside(finding)
         elif finding.unit == causes.TIMES:
             finding = self._scaled(finding)
         else:
             self._scale(finding)
-        same = [f for f in self.found if (f.name, f.of) == (finding.name, finding.of) and f.unit == finding.unit]
+        same = [
+            f
+            for f in self.found
+            if (f.name, f.of) == (finding.name, finding.of) and (f.unit, f.begins) == (finding.unit, finding.begins)
+        ]
         self.found = [f for f in self.found if f not in same] + [joined([*same, finding])]
 
     def _beside(self, finding: Finding) -> Finding:

@@ -21,6 +21,7 @@ from kalmark.diagnosis.linear import OUT, Left, Linear
 
 BLOCKS = 40  # stretches of a run; the variance of their scores is that of a sum of them
 LEAST_INFORMATION = 1e-9
+LEAST_GAIN = 8.0
 SPREADS = (5.0, 20.0, 100.0)  # how many times as wide as the noise outliers may be
 MOST_OUTLIERS = 0.2  # of all observations: more are noise
 FIRST_SHARE, MIXTURE_ROUNDS = 0.01, 30
@@ -47,8 +48,9 @@ class Finding:
     That is robot, sensor and column, or robot, column and kind of error of its controls, or a landmark, or a robot.
     `value` and `sigma` are its size in `unit`.  `cure` is what takes it out of the data: the systematic error itself as
     (Z, W), factors of the noise (N,) and of the motion's errors (r,).  `since_s` is when it begins, after the first
-    scan, None for all the time.  `alike` are causes that explain the same.  `moved_m` is by how much a place in the map
-    is wrong for it while it was seen.  `at` is where a surveyed landmark seems to be, or the step (q,) of a jump.
+    scan, None for all the time, `until_s` when a systematic error ends.  `alike` are causes that explain the same.
+    `moved_m` is by how much a place in the map is wrong for it while it was seen.  `at` is where a surveyed landmark
+    seems to be, or the step (q,) of a jump.
     """
 
     name: str
@@ -64,9 +66,20 @@ class Finding:
     errors: Array | None = None
     rows: Flags | None = None
     since_s: float | None = None
+    until_s: float = math.inf
     alike: tuple[Finding, ...] = ()
     moved_m: float | None = None
     at: Array | None = None
+
+    @property
+    def is_steady(self) -> bool:
+        """True if it is a systematic error all the time."""
+        return self.Z is not None and self.at is None and self.since_s is None
+
+    @property
+    def begins(self) -> bool:
+        """True if it is a systematic error that begins during the run."""
+        return self.Z is not None and self.at is None and self.since_s is not None
 
     @property
     def overstated(self) -> bool:

@@ -27,6 +27,7 @@ from kalmark.diagnosis.trials import (
     first_events,
     first_of,
     fit_of_run,
+    fit_with,
     likelihood_gain,
     log_from,
 )
@@ -41,6 +42,7 @@ from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 
 FEW_SCANS = 80  # of them at first: a log that does not fit shows it soon
+LIKELIEST = 5  # mistakes of those by the first scans that are tried in more
 MUCH = 3.0  # times better is the log without the mistake
 LEAST_FIXES = 5  # in a row that do not fit: their robot is not where it should be
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
@@ -60,10 +62,11 @@ def gross(run: Run, log: Log, alarmed: bool = False, progress: bool = False) -> 
     now = fit_of_run(run)
     first, fits = misfits_from(now), now.mean < MISFIT and not run.stopped
     of_ids = find_wrong_ids(run, log, now)
-    if of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS:
-        return of_ids
     alone = None if fits and not alarmed else likeliest(run, log, first_events(run, log), run.config, progress)
-    if alone is None and first is not None:
+    if alone is not None and of_ids is not None:  # it was found in the first events: of all it is compared
+        alone = alone._replace(gain=likelihood_gain(now, fit_with(log, log.events, alone)))
+    explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
+    if alone is None and first is not None and not explained:
         alone = find_later_mistake(run, log, first)
     if alone is None or (of_ids is not None and alone.gain < of_ids[0].gain):
         return of_ids
@@ -81,9 +84,13 @@ def likeliest(
     changes, made = [*mistakes(config, run)], list[Mistake]()
     if (run.history.id == "").any():  # else what is left of the data shows it
         changes += [late for name in run.history.robots for late in late_or_early(config, events, name)]
-    for change in track(changes, "mistakes, one after the other", show=progress):
-        if likelihood_gain(few.as_it_is, few.with_change(change)) > -SURELY:
-            made += every.explain(change)
+    gains = [
+        likelihood_gain(few.as_it_is, few.with_change(change))
+        for change in track(changes, "mistakes, one after the other", show=progress)
+    ]
+    for n in sorted(range(len(gains)), key=lambda n: -gains[n])[:LIKELIEST]:
+        if gains[n] > -SURELY:
+            made += every.explain(changes[n])
     late = max((one for one in made if one.name == LATE), key=lambda one: one.gain, default=None)
     made = [one for one in made if one.name != LATE or one is late]
     off = [*every.explain(Mistake(OUTLIERS, "", "", gated(config)))] if made else []

@@ -21,6 +21,7 @@ from kalmark.results.run import Run
 from kalmark.slam.robot import Robot
 
 TURNS_DEG = (180, 90, -90)
+HEIGHTS_M = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0)  # of beacons above a robot of the plane, or below it
 DEGREE = math.pi / 180
 LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
 SPEEDS = {"kilometres per hour": 1 / 3.6, "miles per hour": 0.44704}
@@ -66,6 +67,7 @@ def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
         yield from _of_columns(config, sensors)
     for robot in robots.values():
         yield from _of_mounts(config, robot)
+        yield from _of_heights(config, robot)
     for robot in robots.values():
         yield from _of_controls(config, robot)
     if any(column.endswith("ps") for robot in robots.values() for column in robot.motion.columns):
@@ -137,6 +139,18 @@ def _of_mounts(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
     for together in places.values():
         for sensors in [together, *([sensor] for sensor in together if len(together) > 1)]:
             yield from (_turned(config, robot.name, sensors, turn, space) for turn in TURNS_DEG)
+
+
+def _of_heights(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
+    """Yield that what a sensor of the plane measures the range of is at another height."""
+    for sensor in (name for name, mount in robot.sensors.items() if tuple(mount.sensor.columns) == ("range_m",)):
+        path = ("robots", robot_section(config, robot.name), "sensors", sensor, "mount", "z_m")
+        for height_m in HEIGHTS_M if robot.motion.space.axes == 1 else ():
+            evidence = (
+                f"ranges of {robot.name}.{sensor} fit only if they are of things {height_m:g} m above or below it"
+            )
+            cure = f"--set robots.{robot.name}.sensors.{sensor}.mount.z_m={-height_m:g}"
+            yield Mistake("height", evidence, cure, with_value(config, path, -height_m))
 
 
 def _turned(config: Mapping[str, Any], robot: str, sensors: list[str], turn: int, space: bool) -> Mistake:

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from kalmark.arrays import Array
-from kalmark.diagnosis.cause_search import LEAST_GAIN
 from kalmark.diagnosis.cause_texts import log_correction_line
+from kalmark.diagnosis.causes import LEAST_GAIN
 from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, configured_value, robot_section, with_value
 from kalmark.diagnosis.trials import (
     FITS,

@@ -113,9 +113,7 @@ class Trials:
 
     def with_change(self, change: Mistake) -> Fit:
         """Return the fit of the events with a change."""
-        events = sorted(map(change.change, self.events), key=sort_key) if change.change else self.events
-        run = filter_events(change.config, self.log, events)
-        return REFUSED if run is None else fit_of_run(run, change.shrunk)
+        return fit_with(self.log, self.events, change)
 
     def explain(self, change: Mistake) -> Iterator[Mistake]:
         """Yield a change with its gain, if the events fit with it, and are surely likelier."""
@@ -123,6 +121,13 @@ class Trials:
         gain = likelihood_gain(self.as_it_is, after)
         if after.mean < FITS and gain > SURELY * max(after.mean, 1.0):
             yield change._replace(gain=gain, since_s=self.events[0].t_s)
+
+
+def fit_with(log: Log, events: Iterable[Event], change: Mistake) -> Fit:
+    """Return the fit of some events of a log with a change."""
+    changed = sorted(map(change.change, events), key=sort_key) if change.change else [*events]
+    run = filter_events(change.config, log, changed)
+    return REFUSED if run is None else fit_of_run(run, change.shrunk)
 
 
 def first_of(made: Sequence[Mistake]) -> Mistake | None:

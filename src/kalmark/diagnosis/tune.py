@@ -27,8 +27,7 @@ from kalmark.config.tree import Tree, read_tree
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import NEAR, apply_calibration, sensors_of
 from kalmark.diagnosis.calibrations import ALPHA, calibrations
-from kalmark.diagnosis.cause_search import LEAST_GAIN
-from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.causes import LEAST_GAIN, Finding
 from kalmark.diagnosis.components import Components, Estimate, Noise
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.tunable_keys import Keys, Path_, Values

@@ -14,23 +14,23 @@ from scipy.special import pdtrc
 from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.batch_state import LANDMARKS, POSES
 from kalmark.diagnosis import doubled_landmarks, repeated_events
-from kalmark.diagnosis.batch_search import MORE, WORST, Searched, misfits, search_causes
+from kalmark.diagnosis.batch_search import MORE, WORST, Searched, associated, misfits, search_causes
 from kalmark.diagnosis.blind import blind
-from kalmark.diagnosis.cause_search import LEAST_GAIN, Search, joined
+from kalmark.diagnosis.cause_search import Search, joined
 from kalmark.diagnosis.cause_texts import finding_text, odd_control_text
-from kalmark.diagnosis.causes import JUMPS, TIMES, Finding
+from kalmark.diagnosis.causes import JUMPS, LEAST_GAIN, TIMES, Finding
 from kalmark.diagnosis.error_columns import ALL
 from kalmark.diagnosis.gross_mistakes import gross, started_at
 from kalmark.diagnosis.jumps import LISTED, Controls, merge_jumps
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.lost import find_lost_robots, unchecked_ends
 from kalmark.diagnosis.mistakes import LATE, Mistake
+from kalmark.diagnosis.onsets import without_onset
 from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
 from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
 from kalmark.diagnosis.trials import FITS, LOST, filter_events, fit_of_run, likelihood_gain, with_cure
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.trials import MOST as MOST_D2
-from kalmark.diagnosis.turned_mounts import TURNED
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.report import ELSEWHERE as CARRIED
@@ -174,7 +174,7 @@ def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
     verdict = _judged(run, log, first, most, progress)
     cured = _with_cure(run, log, verdict, alarmed, most, progress, least=mistake.gain)
     others = verdict.search is not None and OUTLIERS not in [c.name for c in verdict.causes]
-    untried = max((f.gain for f in _steady(verdict) if not _own_cure(run, f)), default=0.0)
+    untried = max((f.gain for f in _steady(verdict.search) if not _own_cure(run, f)), default=0.0)
     if cured is not verdict or untried > mistake.gain or (mistake.name == OUTLIERS and others):  # it explains more
         return cured
     bent, off_m = _bent(run, without.run)
@@ -191,34 +191,53 @@ def _with_cure(
 
     That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
     """
-    steady = _steady(verdict)
+    steady = _steady(verdict.search)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
-    doubted |= any(f.name == LATE for f in steady[:TRIED])  # of no other is the size so far from linear
+    doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
+    doubted |= any(f.name == LATE or f.begins for f in steady[:TRIED])  # whose sizes are so far from linear
+    if len(run.history.d2) > MOST or not doubted:
+        return verdict
+    tried = [*also, *steady[:TRIED], *_of_less_certain_controls(run, log, most, progress)]
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
-    for n in range(ROUNDS if len(run.history.d2) <= MOST and (doubted or also) else 0):
-        tried = [without_error(*at, f) for f in (steady[:1] if n else (*also, *steady[:TRIED]))]
-        gain, without, changed, one = max(tried, key=lambda of: of[0], default=(0.0, *at, None))
+    for n in range(ROUNDS):
+        cured = [without_error(*at, f) for f in tried]
+        gain, without, changed, one = max(cured, key=lambda of: of[0], default=(0.0, *at, None))
         if one is None or gain < max(LEAST_GAIN, 0.0 if n else least):
             break
-        have = [taken[key]] if (key := (one.name, *one.of)) in taken else []
+        have = [taken[key]] if (key := (one.name, *one.of, str(one.begins))) in taken else []
         taken[key] = joined([*have, replace(one, gain=gain)])
         at = without, changed
         rest = _judged(*at, _structural(*at, []), most, progress)
-        steady = _steady(rest)
+        tried = _steady(rest.search)[:1]
+        if fit_of_run(without).mean > MISFITS_ALL:
+            tried += _of_less_certain_controls(*at, most, progress)
     if not taken:
         return verdict
-    causes = [_cause(run, f, log) for f in sorted(taken.values(), key=lambda f: -f.gain)]
+    causes = [_cause(run, f, log) for f in taken.values()]
     left = [c for c in rest.causes if c.name not in [f.name for f in taken.values()]]
-    before = [c for c in left if c.name == verdict.causes[0].name and not c.harmless][:1]  # is not explained
+    worst = {c.name for c in verdict.causes[:1]}
+    before = [c for c in left if c.name in worst and not c.harmless][:1]  # is not explained
     after = (c for c in left if c not in before)
     status = worst_status(verdict.map, _bent(run, at[0])[0])
     return replace(verdict, map=status, causes=(*before, *causes, *after))
 
 
-def _steady(verdict: Verdict) -> list[Finding]:
+def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> tuple[Finding, ...]:
+    """Return the systematic errors that a search finds by associations of less certain controls."""
+    wide = associated(run, log)
+    if wide is run:
+        return ()
+    try:
+        search = search_causes(wide, log, most, max(MOST, MORE * most), progress).search
+    except (KalmarkError, np.linalg.LinAlgError):
+        return ()
+    return tuple(f for f in _steady(search) if f.unit != TIMES)[:TRIED]
+
+
+def _steady(search: Search | None) -> list[Finding]:
     """Return the systematic errors and larger noise that a search found, the one that explains most first."""
-    found = verdict.search.found if verdict.search else ()
-    steady = (f for f in found if f.at is None and (f.Z is not None or (f.unit == TIMES and not f.overstated)))
+    found = search.found if search else ()
+    steady = (f for f in found if f.is_steady or f.begins or (f.unit == TIMES and not f.overstated))
     return sorted(steady, key=lambda f: -f.gain)
 
 
@@ -229,7 +248,11 @@ def _own_cure(run: Run, finding: Finding) -> str:
 
 def without_error(run: Run, log: Log, finding: Finding) -> tuple[float, Run, Log, Finding]:
     """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that."""
-    made = with_cure(run.config, log, _own_cure(run, finding))
+    if finding.begins:
+        changed = without_onset(run, log, finding)
+        made = None if changed is None else (run.config, changed, list(changed.events))
+    else:
+        made = with_cure(run.config, log, _own_cure(run, finding))
     after = None if made is None else filter_events(*made)
     if made is None or after is None:
         return 0.0, run, log, finding
@@ -382,8 +405,9 @@ def _cause(run: Run, finding: Finding, log: Log | None) -> Cause:
         told = f"{told[0]}; {more}", told[1]
     if odd is not None:
         name, told = JUMP, odd_control_text(finding, odd)
-    if name == TURNED and log is not None:
-        told = f"from t={since_s:.1f} s on {told[0]}", ""
+    if finding.begins:
+        end_s = begin_s(run) + finding.until_s
+        told = f"from t={since_s:.1f} {'s on' if end_s == math.inf else f'to {end_s:.1f} s'} {told[0]}", ""
     return Cause(name, since_s, finding.gain, *told, harmless)
 
 

@@ -45,7 +45,8 @@ class Movement(NamedTuple):
 
     >>> rover = km.motion.Unicycle()
     >>> u = np.array([0.5, 0.1])
-    >>> one = Movement(rover, 0, [], False, False, np.zeros((2, 0)), u, rover.control_noise(u), np.zeros((0, 0)), dt_s=0.1)
+    >>> N, none = rover.control_noise(u), np.zeros((0, 0))
+    >>> one = Movement(rover, 0, [], False, False, np.zeros((2, 0)), u, N, none, dt_s=0.1)
     >>> one.model.move(np.zeros(3), one.u, one.dt_s)[0].round(3)
     array([0.05, 0.  , 0.01])
     """

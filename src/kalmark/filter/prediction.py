@@ -103,6 +103,13 @@ def spread_rays(P: Array, atoms: Table, Q: Array) -> None:
                         P[k + a, l + b] += c * Q[a, b]
 
 
+@compiled
+def write_mean(x: Array, x_first: Array, at: int, mean: Array) -> None:
+    """Write the mean of a block after a motion, and its first estimate."""
+    for i in range(len(mean)):
+        x[at + i] = x_first[at + i] = mean[i]
+
+
 def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     """Move a robot in a map; return whether all of it is finite: if not, nothing has changed.
 
@@ -140,10 +147,9 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     kernels.predict(P, n, index, F, Q)  # [S] (15)-(17)
     if spreads:
         spread_rays(P, atoms, Q)
-    for i in range(size):
-        x[at + i] = x_first[at + i] = moved[i]
-    for i in range(len(u) if begins else 0):
-        x[blocks[added[0], 0] + i] = x_first[blocks[added[0], 0] + i] = 0.0
+    write_mean(x, x_first, at, moved)
+    if begins:
+        write_mean(x, x_first, blocks[added[0], 0], np.zeros(len(u)))
     return True
 
 

@@ -1,4 +1,4 @@
-"""Is a sensor that is turned on the way named, with its time, and what it adds to the data right?"""
+"""Are errors in a part of a run named, with their times: a sensor that is turned, wheels that slip?"""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import replay_events
 from kalmark.batch.problem import sightings
 from kalmark.config import build_slam, config_dict
+from kalmark.diagnosis.batch_search import associated
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.turned_mounts import _turns
-from kalmark.events import Scan
+from kalmark.diagnosis.onsets import _turns
+from kalmark.events import Control, Scan
 from kalmark.geometry.frames import compose
 from kalmark.geometry.frames3d import compose as compose3d
 from kalmark.geometry.rotations import exp
 from kalmark.models.observe import view_of
-from kalmark.results.batch import batch_input
+from kalmark.results.batch import batch_input, log_of_run
+from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 
 PLANE = ("world.count=30", "world.size_m=24", "steps=400", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")
@@ -43,6 +45,41 @@ def test_a_sensor_that_is_turned_by_ten_degrees_on_the_way_is_named_first() -> N
     assert float(cause.evidence.split("turned by ")[1].split()[0]) == pytest.approx(10.0, abs=0.5)
     assert cause.cure == ""
     assert all(other.score < 0.02 * cause.score for other in others), others
+
+
+def slipping(ids: bool, begin_s: float, end_s: float) -> tuple[km.Verdict, Run]:
+    """Return the verdict on a run whose robot moves by less than its controls say for some time."""
+    world = load_world("random_field", (*PLANE, "filter.association={type: auto}"))
+    log, config = simulate(world, 3), world.config()
+    events = [
+        replace(e, u=e.u * [2.0, 1.0])
+        if isinstance(e, Control) and begin_s <= e.t_s < end_s
+        else replace(e, ids=None)
+        if isinstance(e, Scan) and not ids
+        else e
+        for e in log.events
+    ]
+    log = replace(log, events=events)
+    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)
+    return km.diagnose(run), run
+
+
+@pytest.mark.parametrize("ids", [True, False])
+def test_wheels_that_slip_for_a_while_are_named_first_with_both_times(ids: bool) -> None:
+    verdict, run = slipping(ids, 10.0, 14.0)
+    cause = verdict.causes[0]
+    assert cause.name in ("odometry_scale", "odometry_offset"), verdict.causes
+    begin_s, end_s = (float(cause.evidence.split(word)[1].split()[0]) for word in ("t=", " to "))
+    assert begin_s == pytest.approx(10.0, abs=0.3)
+    assert end_s == pytest.approx(14.0, abs=0.3)
+    assert cause.cure == ""
+    if not ids:
+        assert associated(run, log_of_run(run)) is not run, "associations of less certain controls"
+
+
+def test_the_associations_of_a_run_that_fits_are_those_it_has() -> None:
+    _, run = slipping(False, 0.0, 0.0)
+    assert associated(run, log_of_run(run)) is run
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,202 @@
+"""Systematic errors in a part of a run: a sensor that is turned, wheels that slip for a while, a bias that jumps.
+
+The times are those of the largest score (Basseville, Nikiforov 1993, section 2.4), looked for among stretches of the
+run, then near the best of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from kalmark.arrays import Array, Index
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
+from kalmark.batch.problem import Factor
+from kalmark.diagnosis.causes import LEAST_GAIN, LEAST_INFORMATION, SEEN, SHOWS, Finding, systematic
+from kalmark.diagnosis.error_columns import Column
+from kalmark.diagnosis.linear import Linear
+from kalmark.events import Control, Event, Scan
+from kalmark.geometry.rotations import matrix
+from kalmark.logs.log import Log
+from kalmark.models.observe import MOUNT, sensor_pose
+from kalmark.results.run import Run
+
+TURNED = "mount"  # the cause that a sensor was turned
+STRETCHES, ROUNDS = 20, 4  # in which the time is looked for, and how often within the best of them
+TRIED = 3  # errors whose time is looked for
+BEARINGS = ("bearing_rad", "azimuth_rad")
+
+
+def find_onsets(linear: Linear, columns: list[Column], t_s: Array) -> list[Finding]:
+    """Return the systematic errors that explain most in a part of the run, and clearly more than all the time.
+
+    `t_s` (n,) are the times of the poses.  An error that is smaller than the noise of a sighting or a step is none: a
+    calibration drifts.  `p` counts that the times were looked for.
+    """
+    row_s, step_s = _times(linear, t_s)
+    turns = [column for column in turned_mounts(linear) if column.Z.any()]
+    turned = {column.of for column in turns}  # an offset of their angles is a turn of the mount
+    columns = [*(c for c in columns if c.unit != "rad" or c.of[:2] not in turned), *turns]
+    likely, found = list[tuple[float, Column]](), list[Finding]()
+    edges = np.quantile(t_s, np.linspace(0.0, 1.0, STRETCHES, endpoint=False))
+    for column in columns:
+        gains = _gains(linear, column, row_s, step_s, edges)
+        if gains.max() > gains[0, -1] + LEAST_GAIN:
+            likely.append((float(gains.max()), column))
+    for _, column in sorted(likely, key=lambda one: -one[0])[:TRIED]:
+        found += _passing(linear, column, t_s)
+    return found
+
+
+def _times(linear: Linear, t_s: Array) -> tuple[Array, Array]:
+    """Return the times of each residual (N,) and of each error of the motion (q n,)."""
+    n = len(linear.problem.robots)
+    return t_s[linear.rows.node], np.repeat(t_s, len(linear.at.w) // max(n, 1))
+
+
+def _passing(linear: Linear, column: Column, t_s: Array) -> Iterator[Finding]:
+    """Yield an error in the best part of a run, if that explains clearly more than all of it and is seen at once."""
+    row_s, step_s = _times(linear, t_s)
+    times = np.sort(np.concatenate([row_s[column.Z != 0.0], step_s[column.W != 0.0]]))[SEEN:-SEEN]
+    if len(times) < STRETCHES:
+        return
+    gain, begin_s, end_s = _best_part(linear, column, row_s, step_s, np.unique(times))
+    if gain <= LEAST_GAIN + max((one.gain for one in systematic(linear, [column])), default=0.0):
+        return
+    Z, W = (
+        np.where((begin_s <= of_s) & (of_s < end_s), part, 0.0)
+        for of_s, part in ((row_s, column.Z), (step_s, column.W))
+    )
+    part = column._replace(Z=Z, W=W, most=1.0 if W.any() and not column.unit else column.most)  # wheels that spin
+    for one in systematic(linear, [part]):
+        variance = linear.root.power(2).sum(axis=1)
+        by_steps = W[variance > 0.0] ** 2 / variance[variance > 0.0]
+        shown = np.concatenate([Z[Z != 0.0] ** 2, by_steps[by_steps != 0.0]]) * one.value**2
+        if float(shown.mean()) > SHOWS**2:
+            p = min(1.0, one.p * len(times) * (1 if end_s == math.inf else len(times)))
+            if W.any():  # an error of a step begins and ends at the pose before
+                begin_s, end_s = (t_s[t_s < s].max(initial=0.0) if s < math.inf else s for s in (begin_s, end_s))
+            yield replace(one, p=p, since_s=float(begin_s), until_s=float(end_s))
+
+
+def turned_mounts(linear: Linear) -> Iterator[Column]:
+    """Yield the turns of each sensor about the axis of the plane, or those of its robot."""
+    for f, factor in enumerate(linear.problem.factors):
+        if factor.sensor[1] and [b.group for b in factor.term.blocks] == [POSES, LANDMARKS]:
+            for turn in _turns(linear, f, factor):
+                yield Column(TURNED, factor.sensor, "rad", turn, np.zeros(len(linear.at.w)), math.pi / 2)
+
+
+def _turns(linear: Linear, f: int, factor: Factor) -> Iterator[Array]:
+    """Yield the change of the data (N,) by one radian of a mount: about the axis of the plane or those of the robot."""
+    E, factors = factor.term.at(linear.state)[1], linear.problem.factors
+    for axis in _axes(linear.state, factor):
+        parts = [np.zeros(other.R.shape[:2]) for other in factors]
+        parts[f] = np.nan_to_num(np.einsum("kij,kj->ki", E[:, :, : axis.shape[1]], axis))
+        yield linear.whitened(parts)
+
+
+def _axes(state: BatchState, factor: Factor) -> Iterator[Array]:
+    """Yield how a robot would move (K, dof), about its sensor, to see what the sensor sees if that turns."""
+    block, mount = factor.term.blocks[0], factor.view[MOUNT] if isinstance(factor.view, tuple) else factor.view.mount
+    poses = state.groups[POSES][block.rows]
+    arm = poses[:, : state.d] - np.array([sensor_pose(pose, mount)[0][: state.d] for pose in poses])
+    if state.d == 2:
+        yield np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(poses))])
+        return
+    for axis in np.array([matrix(pose[3:]) for pose in poses]).transpose(2, 0, 1):
+        yield np.column_stack([np.cross(axis, arm), axis])
+
+
+def _best_part(
+    linear: Linear, column: Column, row_s: Array, step_s: Array, times: Array
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the gain of an error in the best part of a run, and when that begins and ends, among `times` (T,).
+
+    It ends only if that explains clearly more.
+    """
+    best, some = (0.0, 0.0, math.inf), _evenly(times, STRETCHES)
+    for _ in range(ROUNDS):
+        edges = times[some]
+        gains = _gains(linear, column, row_s, step_s, edges)
+        first, last = divmod(int(np.argmax(gains)), len(edges))
+        if gains[:, -1].max() > gains[first, last] - LEAST_GAIN:
+            first, last = int(np.argmax(gains[:, -1])), len(edges) - 1
+        ends = last < len(edges) - 1
+        best = float(gains[first, last]), float(edges[first]), float(edges[last + 1]) if ends else math.inf
+        closer = np.unique(np.concatenate([_near(times, some, k) for k in ((first, last + 1) if ends else (first,))]))
+        if np.array_equal(closer, some):
+            break
+        some = closer
+    return best
+
+
+def _near(times: Array, some: Index, k: int) -> Index:
+    """Return the numbers of times from the one of `some` before the k-th to the one after it."""
+    a, b = int(some[max(k - 1, 0)]), int(some[min(k + 1, len(some) - 1)])
+    return a + _evenly(times[a : b + 1], STRETCHES // 2)
+
+
+def _evenly(times: Array, number: int) -> Index:
+    """Return the numbers of so many of the times, or all."""
+    return np.unique(np.linspace(0, len(times) - 1, number).astype(np.int64))
+
+
+def _gains(linear: Linear, column: Column, row_s: Array, step_s: Array, edges: Array) -> Array:
+    """Return the gains (S, S) of an error from the begin of one stretch to the end of another, 0 of no information.
+
+    The stretches begin at `edges` (S,).
+    """
+    Z, W = (
+        np.where((np.searchsorted(edges, of_s, side="right") - 1)[:, None] == np.arange(len(edges)), of[:, None], 0.0)
+        for of_s, of in ((row_s, column.Z), (step_s, column.W))
+    )
+    left, have = linear.left(Z, W), linear.residuals
+    g = np.append(0.0, np.cumsum(Z.T @ have.r + W.T @ have.m))
+    I = np.pad(np.cumsum(np.cumsum(Z.T @ left.r + W.T @ left.m, axis=0), axis=1), ((1, 0), (1, 0)))
+    most = I.diagonal()
+    g, I = g[1:] - g[:-1, None], most[1:] + most[:-1, None] - I[:-1, 1:] - I[1:, :-1].T
+    enough = np.triu(LEAST_INFORMATION * most.max(initial=0.0) < I)
+    return np.asarray(np.where(enough, 0.5 * g * g / np.where(enough, I, 1.0), 0.0))
+
+
+# ------------------------------------------------------------------ the log without it
+def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
+    """Return a log without an error in a part of it, of a column of a sensor or of the controls; None of others."""
+    robot, second, *rest = finding.of
+    of, s, first_s = run.final_slam().robots[robot], finding.value, float(run.history.t_ns[0]) * 1e-9
+    begin_s, end_s = (first_s + (t or 0.0) for t in (finding.since_s, finding.until_s))
+    is_control = rest[-1:] in (["scale"], ["offset"], ["per_way"])
+    names = of.motion.columns if is_control else of.sensors[second].sensor.columns if second in of.sensors else ()
+    wanted = (second,) if is_control else BEARINGS if finding.name == TURNED else tuple(rest)
+    k = [names.index(name) for name in wanted if name in names]
+    if not k:
+        return None
+    each_s = np.diff([e.t_s for e in log.events if isinstance(e, Control) and e.robot == robot])
+
+    def changed(a: Array) -> Array:
+        a = a.copy()
+        if finding.name.endswith("scale"):
+            a[..., k] *= 1.0 + s if is_control else 1.0 / (1.0 + s)
+        elif rest[-1:] == ["per_way"]:
+            a[..., k] += s * np.abs(a[..., :1])
+        elif is_control:
+            a[..., k] += s * (1.0 if of.motion.held else float(np.median(each_s)))
+        else:
+            a[..., k] += s if finding.name == TURNED else -s
+        return a
+
+    def corrected(e: Event) -> Event:
+        if e.robot != robot:
+            return e
+        within = begin_s <= e.t_s < end_s
+        if is_control and isinstance(e, Control) and (within if of.motion.held else begin_s < e.t_s <= end_s):
+            return replace(e, u=changed(e.u))
+        if within and isinstance(e, Scan) and e.sensor == second and len(e.y):
+            return replace(e, y=changed(e.y))
+        return e
+
+    return replace(log, events=[corrected(e) for e in log.events])
