@@ -88,8 +88,9 @@ def likeliest(
         likelihood_gain(few.as_it_is, few.with_change(change))
         for change in track(changes, "mistakes, one after the other", show=progress)
     ]
-    for n in sorted(range(len(gains)), key=lambda n: -gains[n])[:LIKELIEST]:
-        if gains[n] > -SURELY:
+    least = max([-SURELY, *sorted(gains)[-LIKELIEST:][:1]])
+    for n in range(len(gains)):
+        if gains[n] >= least:
             made += every.explain(changes[n])
     late = max((one for one in made if one.name == LATE), key=lambda one: one.gain, default=None)
     made = [one for one in made if one.name != LATE or one is late]
