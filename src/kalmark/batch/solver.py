@@ -1,8 +1,9 @@
-"""The optimum of a problem by Gauss-Newton, by Newton's method once near, or by Levenberg's method.
+"""The optimum of a problem by Gauss-Newton, by Newton's method where that is slow, or by Levenberg's method.
 
 A step is taken along the exponential: a stretch of the path that turns takes its observed landmarks along.  With motion
 it is halved until the merit falls, which is the cost plus an exact penalty on the constraints (Nocedal & Wright,
-Numerical Optimization, 18.3).  Outliers make Gauss-Newton slow, so the last steps use the curvature.
+Numerical Optimization, 18.3).  Large residuals make Gauss-Newton slow: where it lowers the merit little, the steps use
+the curvature.
 
 The step dx and the multipliers m of `minimise |z - H dx|^2 + w' Q^+ w subject to w = e + J dx` solve
 
@@ -32,7 +33,7 @@ from kalmark.batch.problem import Linearized, Problem
 from kalmark.errors import KalmarkError
 from kalmark.events import Id
 
-NEAR = 1e-2  # relative step below which Newton's method is tried
+SLOW = 1e-2  # of the merit, by which a step lowers it, below which Newton's method is tried
 ROUNDING = 1e-6  # relative step below which the cost does not distinguish which of two states is better
 DAMPING = 1e-4  # the first of Levenberg's method
 CHUNK = 128  # columns of the Schur complement at once: bounds the memory
@@ -102,23 +103,27 @@ def optimum(
 
 
 class _Search:
-    """State of the search: the problem there, the multipliers of the motion, the penalty (q,) on its violation."""
+    """State of the search: the problem there, the multipliers (w,) of the motion, the penalties (w,) on its violation.
+
+    Each constraint has its own penalty: one whose multiplier is small, a motion that is not known, hinders no step.
+    `slow` if the last step lowered the merit by less than `SLOW`.
+    """
 
     def __init__(self, problem: Problem, start: BatchState) -> None:
         _refuse_hidden(problem, start)
         self.problem, self.at, self.size = problem, problem.at(start), np.inf
-        self.damping, self.flat = 0.0 if len(self.at.w) else DAMPING, False
-        self.multipliers, self.penalty = np.zeros(len(self.at.w)), np.zeros(start.spaces[POSES].dof)
+        self.damping, self.flat, self.slow = 0.0 if len(self.at.w) else DAMPING, False, False
+        self.multipliers, self.penalty = np.zeros((2, len(self.at.w)))
         self.followers = followers(self.at)
 
     def advance(self) -> None:
-        """Take one step, of Newton's method if near and if that lowers the merit; without motion of Levenberg's."""
+        """Take one step, of Newton's method if slow and if that lowers the merit; without motion of Levenberg's."""
         if self.damping:
             lower = self._take(Reduced(self.problem, self.at, damping=self.damping), shortest=1.0)
             self.damping = 0.1 * self.damping if lower else max(10 * self.damping, 1e-9)
             self.flat = self.size < ROUNDING and not lower
             return
-        if self.size < NEAR:
+        if self.slow:
             try:
                 if self._take(Reduced(self.problem, self.at, self.multipliers)):
                     return
@@ -134,22 +139,21 @@ class _Search:
     def _take(self, reduced: Reduced, shortest: float = 1e-6) -> bool:
         """Go the longest of 1, 1/2, 1/4, ... `shortest` of a step that lowers the merit; return whether there is."""
         step, multipliers = reduced.step()
-        change, q = multipliers - self.multipliers, len(self.penalty)
-        self.size = self.at.state.relative(step)
-        self.penalty = np.maximum(self.penalty, 1.5 * np.abs(multipliers).reshape(-1, q).max(axis=0, initial=0.0))
+        change, self.size = multipliers - self.multipliers, self.at.state.relative(step)
+        self.penalty = np.maximum(self.penalty, 1.5 * np.abs(multipliers))
         now, fraction = self._merit(self.at, self.multipliers), 1.0
         while fraction >= shortest:
             at = self.problem.at(self.at.state.moved(fraction * step, self.followers))
             there = self.multipliers + fraction * change
-            if self._merit(at, there) < now or (self.size < ROUNDING and not self.damping):  # NaN is not lower
-                self.at, self.multipliers = at, there
+            merit = self._merit(at, there)
+            if merit < now or (self.size < ROUNDING and not self.damping):  # NaN is not lower
+                self.at, self.multipliers, self.slow = at, there, now - merit < SLOW * now
                 return True
             fraction /= 2
         return False
 
     def _merit(self, at: Linearized, multipliers: Array) -> float:
-        defect = np.abs(at.w - self.problem.motions.Q @ multipliers).reshape(-1, len(self.penalty)).sum(axis=0)
-        return self.cost(at, multipliers) + float(self.penalty @ defect)
+        return self.cost(at, multipliers) + float(self.penalty @ np.abs(at.w - self.problem.motions.Q @ multipliers))
 
 
 def _refuse_hidden(problem: Problem, start: BatchState) -> None:
