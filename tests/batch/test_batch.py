@@ -12,12 +12,14 @@ import pytest
 
 import kalmark as km
 from batch_dense import Link, Sight, link, optimum
+from kalmark.batch import solver
 from kalmark.batch.batch_state import POSES, BatchState, plus
 from kalmark.batch.data import replay_events
 from kalmark.batch.motion_chain import Chain
 from kalmark.batch.problem import Rows
 from kalmark.batch.solver import Batch
 from kalmark.config import build_slam, load_config, open_config_log
+from kalmark.diagnosis.batch_search import subsample
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Fix, Scan, sort_key
 from kalmark.geometry import V, wrap
@@ -342,6 +344,26 @@ def test_a_search_cut_short_says_how_far_it_came() -> None:
     run = record(slam_for(log), log, progress=False, pictures=False)
     with pytest.raises(KalmarkError, match=r"the last of 1 steps is .* of the map, expected 1e-09"):
         solve_batch(run, log, iterations=1)
+
+
+@pytest.mark.parametrize(("seed", "most"), [(0, 600), (7, 10_000)])
+def test_ranges_that_fit_badly_settle(seed: int, most: int) -> None:
+    """Eight times the noise stated: Gauss-Newton crawls; between segments a heading passes 180 degrees."""
+    rng = np.random.default_rng(seed)
+    points, x, log = rng.uniform(-60, 60, (8, 2)), np.zeros(3), list[Event]()
+    for k in range(400):
+        u = np.array([1.5, 0.0, 0.06 * np.sin(k / 25) + 0.02])
+        x = compose(x, u)[0]
+        log.append(Control(0.5 * (k + 1), "r", u + rng.normal(size=3) * [0.05, 0.0, 0.01]))
+        r = np.hypot(*(points - x[:2]).T)
+        seen = np.flatnonzero(r < 80)
+        y = np.maximum(r[seen] + 2.0 * rng.normal(size=len(seen)), 0.1)
+        log.append(Scan(0.5 * (k + 1), "r", "radio", y[:, None], ids=seen.tolist()))
+    radio = km.Mount(km.sensors.Range(sigma_range_m=0.25))
+    motion = km.motion.Odometry2D(sigma_x_m=0.05, sigma_y_m=0.0, sigma_theta_rad=0.01)
+    run = filtered([km.Robot("r", motion, sensors={"radio": radio})], log)
+    batch = solver.optimum(replay_events(subsample(run, batch_input(run), most), log), tolerance=1e-4)
+    assert batch.iterations < 40
 
 
 def test_a_landmark_that_is_not_determined_is_refused() -> None:

@@ -33,7 +33,7 @@ from kalmark.batch.problem import Linearized, Problem
 from kalmark.errors import KalmarkError
 from kalmark.events import Id
 
-SLOW = 1e-2  # of the merit, by which a step lowers it, below which Newton's method is tried
+NEAR = 1e-2  # relative step below which Newton's method is tried, and share of the merit, if a step was shortened
 ROUNDING = 1e-6  # relative step below which the cost does not distinguish which of two states is better
 DAMPING = 1e-4  # the first of Levenberg's method
 CHUNK = 128  # columns of the Schur complement at once: bounds the memory
@@ -106,7 +106,7 @@ class _Search:
     """State of the search: the problem there, the multipliers (w,) of the motion, the penalties (w,) on its violation.
 
     Each constraint has its own penalty: one whose multiplier is small, a motion that is not known, hinders no step.
-    `slow` if the last step lowered the merit by less than `SLOW`.
+    `slow` if Newton's method is to be tried.
     """
 
     def __init__(self, problem: Problem, start: BatchState) -> None:
@@ -147,7 +147,8 @@ class _Search:
             there = self.multipliers + fraction * change
             merit = self._merit(at, there)
             if merit < now or (self.size < ROUNDING and not self.damping):  # NaN is not lower
-                self.at, self.multipliers, self.slow = at, there, now - merit < SLOW * now
+                self.at, self.multipliers = at, there
+                self.slow = self.size < NEAR or (fraction < 1.0 and now - merit < NEAR * now)
                 return True
             fraction /= 2
         return False
