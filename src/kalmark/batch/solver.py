@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -124,11 +125,9 @@ class _Search:
             self.flat = self.size < ROUNDING and not lower
             return
         if self.slow:
-            try:
+            with suppress(UndeterminedError):
                 if self._take(Reduced(self.problem, self.at, self.multipliers)):
                     return
-            except UndeterminedError:
-                pass
         if not self._take(Reduced(self.problem, self.at)):
             raise unsolvable_problem("no step lowers the cost, expected a better start or fewer outliers")
 
