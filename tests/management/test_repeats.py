@@ -75,6 +75,17 @@ def test_places_of_which_one_has_landmarks_that_the_other_has_not_are_two() -> N
     assert found(slam) == []
 
 
+@pytest.mark.parametrize(("number", "seed"), [(8, 7), (8, 11), (10, 4)])
+def test_places_that_are_only_alike_are_two(number: int, seed: int) -> None:
+    """A symmetric circuit: the other half has its shape to .2 m, and that is hardly likelier of one place than of two."""
+    rng, slam = np.random.default_rng(seed), empty()
+    half = rng.uniform(0, 20, (number, 2))
+    part(slam, rng.uniform(0, 20, (20, 2)) + np.array([60.0, 0.0]), rng)
+    part(slam, half, rng)
+    part(slam, -half - 5.0 + 0.2 * rng.normal(size=half.shape), rng)
+    assert found(slam) == []
+
+
 @pytest.mark.usefixtures("never_found")
 def test_a_hall_mapped_twice_is_reported_with_its_time_and_drawn(tmp_path: Path) -> None:
     run = mapped(hall(1, gap_s=4.0), gaps="ignore")

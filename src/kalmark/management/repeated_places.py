@@ -360,7 +360,7 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
         other is not found and 2 * len(other.pairs) > k and other.overlaps(found) and _differ(found, other)
         for other in all_
     )
-    if score <= 0.0:
+    if score <= -math.log(FALSE_ALARMS):  # as likely by chance: the ratio exceeds 1 over it as seldom
         return None
     sure = bool(p <= SURE and fits and not rivals)
     if sure:  # then two of a pair that were seen in one scan were so by a wrong association
