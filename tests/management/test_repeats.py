@@ -77,7 +77,7 @@ def test_places_of_which_one_has_landmarks_that_the_other_has_not_are_two() -> N
 
 @pytest.mark.parametrize(("number", "seed"), [(8, 7), (8, 11), (10, 4)])
 def test_places_that_are_only_alike_are_two(number: int, seed: int) -> None:
-    """A symmetric circuit: the other half has its shape to .2 m, and that is hardly likelier of one place than of two."""
+    """A symmetric circuit: one half has the shape of the other to .2 m, hardly likelier of one place than of two."""
     rng, slam = np.random.default_rng(seed), empty()
     half = rng.uniform(0, 20, (number, 2))
     part(slam, rng.uniform(0, 20, (20, 2)) + np.array([60.0, 0.0]), rng)
