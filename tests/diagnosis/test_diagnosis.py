@@ -561,7 +561,7 @@ def test_ids_that_mean_each_others_landmarks_are_wrong_and_the_robot_is_not_kidn
 
     log = replace(log, events=[*map(swapped, log.events)])
     run = recorded_under(config, log, pictures=True)
-    monkeypatch.setattr(single_ids, "MOST_TRIED", int(share * len(run.history.d2)))
+    monkeypatch.setattr(single_ids, "AT_ONCE", int(share * len(run.history.d2)))
     verdict = km.diagnose(run)
     assert verdict.causes[0].name == "wrong_ids"
     assert verdict.map == ("ok" if share == 1.0 else "doubtful"), "a part of the log says less of the map"

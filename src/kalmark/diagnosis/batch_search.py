@@ -31,7 +31,7 @@ from kalmark.slam.slam import Slam
 NEAR = 1e-4  # of the map's size, is a step of the batch solution from which the search begins
 EVENTS = 4  # times as many as observations are taken
 SEGMENT = 30  # successive scans of each robot that are taken together where not all are
-MORE = 4  # times as many are taken if the segments do not determine the map, up to `MOST` at the end of a run
+MORE = 4  # times as many are taken if the segments do not determine the map, up to `AT_ONCE` at the end of a run
 SELDOM, WORST = 1e-6, 20  # scans of a run that fit so badly by chance, and the worst ones that are looked at
 LOOKED_INTO = 3  # segments with the worst scans
 WIDER = 20.0  # times the noise of its controls with which a run is filtered again that does not fit

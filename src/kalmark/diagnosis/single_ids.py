@@ -18,7 +18,7 @@ from scipy.special import rel_entr
 
 from kalmark.arrays import Array, Flags
 from kalmark.diagnosis.mistakes import Mistake, with_value
-from kalmark.diagnosis.trials import FITS, SURELY, Fit, filter_events, fit_of_run, likelihood_gain, log_from
+from kalmark.diagnosis.trials import AT_ONCE, FITS, SURELY, Fit, filter_events, fit_of_run, likelihood_gain, log_from
 from kalmark.events import Event, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.logs.log import Log
@@ -32,7 +32,6 @@ from kalmark.tracks.channel import Channel, ObservationModel
 
 GATE = 0.9999  # with which a log that does not fit is filtered again
 LEAST = 8  # sightings of an id that do not fit: it may mean another place
-MOST_TRIED = 20_000  # observations that are filtered again at once
 OFF = 6.0  # d2 per degree of freedom of a sighting that does not fit
 MOST = 0.5  # of the ids that were seen meanwhile: more of them are not moved, the robot is
 SHARE = 0.1  # of the sightings of an id that are of another place, or of a place after it was left
@@ -66,12 +65,12 @@ class Filtered(NamedTuple):
 def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | None:
     """Return that ids do not mean one place each, or single sightings are off, and the log filtered without that.
 
-    Of a log of more than `MOST_TRIED` observations that is the part about the first that do not fit.
+    Of a log of more than `AT_ONCE` observations that is the part about the first that do not fit.
     """
     config, far = gated(run.config), _first_off(run.history, now)
     if far is None:
         return None
-    whole = len(now.values) <= MOST_TRIED
+    whole = len(now.values) <= AT_ONCE
     if not whole:
         config, log, now = _part(run, log, now, far)
     first = run if whole and config == run.config else filter_events(config, log, log.events)
@@ -101,10 +100,10 @@ def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | N
 
 
 def _part(run: Run, log: Log, now: Fit, far: int) -> tuple[Mapping[str, Any], Log, Fit]:
-    """Return `MOST_TRIED` observations of a log about one that is far off: configuration, log and their fit."""
+    """Return `AT_ONCE` observations of a log about one that is far off: configuration, log and their fit."""
     h, last = run.history, len(now.values) - 1
-    begin = h.step[max(min(far - MOST_TRIED // 2, last - MOST_TRIED), 0)]
-    end = h.step[min(np.searchsorted(h.step, begin) + MOST_TRIED, last)]
+    begin = h.step[max(min(far - AT_ONCE // 2, last - AT_ONCE), 0)]
+    end = h.step[min(np.searchsorted(h.step, begin) + AT_ONCE, last)]
     config, part = log_from(run, log, int(np.searchsorted(h.step, begin)))
     part = replace(part, events=[e for e in part.events if e.t_ns <= h.t_ns[end]])
     within = (h.t_ns[h.step] >= h.t_ns[begin]) & (h.t_ns[h.step] <= h.t_ns[end])

@@ -37,6 +37,7 @@ FEW_SKIPPED = 0.02  # of the events may be refused in a log that fits
 MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
 FITS = 2.0  # below which a log fits
 LOST = 9.0  # what an observation without an id counts that is of no landmark in the map: as one at the gate
+AT_ONCE = 20_000  # observations of a log that are filtered again, or solved for
 MOST = 25.0  # that one observation counts, and what counts one that was left out
 ALIKE = 0.95  # of the gain of the likeliest change: the log does not distinguish them
 SURELY = 50.0  # the gain of what is 10 sigma off

@@ -28,9 +28,8 @@ from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.onsets import without_onset
 from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
 from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
-from kalmark.diagnosis.trials import FITS, LOST, filter_events, fit_of_run, likelihood_gain, with_cure
+from kalmark.diagnosis.trials import AT_ONCE, FITS, LOST, MOST, filter_events, fit_of_run, likelihood_gain, with_cure
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
-from kalmark.diagnosis.trials import MOST as MOST_D2
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.report import ELSEWHERE as CARRIED
@@ -52,7 +51,6 @@ from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 
 __all__ = ["Cause", "Effect", "Verdict", "diagnose"]
 
-MOST = 20_000  # observations that a diagnosis takes
 SEEN = 3  # observations a landmark, of a map that is looked into as a whole at the end of a run
 LEAST, MOST_OFF = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
@@ -126,7 +124,7 @@ class Verdict:
         return figures | {"causes": [vars(cause) for cause in self.causes]}
 
 
-def diagnose(run: Run, most: int = MOST, *, progress: bool = False) -> Verdict:
+def diagnose(run: Run, most: int = AT_ONCE, *, progress: bool = False) -> Verdict:
     """Return the verdict on a run, from about so many of its observations; it is kept in the run's summary.
 
     It reads the log without its truth (`blind`).  With `progress`, standard error shows a bar.  Raises
@@ -195,7 +193,7 @@ def _with_cure(
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
     doubted |= any(f.name == LATE or f.begins for f in steady[:TRIED])  # whose sizes are so far from linear
-    if len(run.history.d2) > MOST or not doubted:
+    if len(run.history.d2) > AT_ONCE or not doubted:
         return verdict
     tried = [*also, *steady[:TRIED], *_of_less_certain_controls(run, log, most, progress)]
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
@@ -228,7 +226,7 @@ def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> 
     if wide is run:
         return ()
     try:
-        search = search_causes(wide, log, most, max(MOST, MORE * most), progress).search
+        search = search_causes(wide, log, most, max(AT_ONCE, MORE * most), progress).search
     except (KalmarkError, np.linalg.LinAlgError):
         return ()
     return tuple(f for f in _steady(search) if f.unit != TIMES)[:TRIED]
@@ -322,9 +320,9 @@ def status_of(causes: Iterable[Cause]) -> str:
 
 def _judged(run: Run, log: Log, first: list[Cause], most: int, progress: bool) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
-    limit = max(MOST, MORE * most)
+    limit = max(AT_ONCE, MORE * most)
     if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
-        most = max(most, MOST)  # its reason may show in all of the log only
+        most = max(most, AT_ONCE)  # its reason may show in all of the log only
     try:
         return _by_batch(run, log, first, search_causes(run, log, most, limit, progress))
     except (KalmarkError, np.linalg.LinAlgError):
@@ -497,7 +495,7 @@ def _lost(run: Run) -> Iterator[Cause]:
         evidence = f"the last {one.number} {one.of} of {one.robot}, from t={one.since_s:.1f} s on, were left out: "
         evidence += "it is not where the path says, or they are wrong"
         cure = "look at what its controls and these say from then on, or state more noise"
-        yield Cause("lost", one.since_s, 0.5 * MOST_D2 * one.number, evidence, cure)
+        yield Cause("lost", one.since_s, 0.5 * MOST * one.number, evidence, cure)
     state, end_s = run.final_slam().state, float(run.history.t_ns.max(initial=0)) * 1e-9
     for robot, of in state.evidence.items():
         since_s, number = max(of.since_ns * 1e-9, begin_s(run)), count(len(of.missed), "landmark")
@@ -516,7 +514,7 @@ def _left_out_until(run: Run, placed: Sequence[RelocatedRobot]) -> float:
         mine = np.flatnonzero(of & (h.t_ns[h.step] <= one.t_ns))
         used = np.flatnonzero(h.outcome[mine] != "rejected")
         rows = mine[used[-1] + 1 if len(used) else 0 :]
-        score += 0.5 * float(np.minimum(h.d2[rows], MOST_D2 * now.dof[rows]).sum())
+        score += 0.5 * float(np.minimum(h.d2[rows], MOST * now.dof[rows]).sum())
     return score
 
 
@@ -526,7 +524,7 @@ def _remapped_landmarks(run: Run) -> Iterator[Cause]:
     for change in (c for c in h.changes if c.reason == BEGUN_AGAIN):
         rows = np.flatnonzero((h.id == change.landmark) & (h.step <= change.step))
         now_s, begun_s = (float(h.t_ns[step]) * 1e-9 for step in (change.step, h.step[rows].min(initial=change.step)))
-        score, cure = 0.5 * MOST_D2 * len(rows), f"leave out its first sighting, at t={begun_s:.1f} s"
+        score, cure = 0.5 * MOST * len(rows), f"leave out its first sighting, at t={begun_s:.1f} s"
         if (h.outcome[rows] != "rejected").sum() > 1:  # there, too, sightings agreed
             told = f"landmark {change.landmark} was moved by t={now_s:.1f} s: from then on it is mapped there"
             yield Cause(MOVED, now_s, score, told, "", True)
