@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,8 @@ import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.config.tree import parse_value
 from kalmark.diagnosis.gross_mistakes import gross
-from kalmark.diagnosis.mistakes import Mistake
-from kalmark.diagnosis.trials import FITS, fit_of_run
+from kalmark.diagnosis.mistakes import Mistake, mistakes
+from kalmark.diagnosis.trials import FITS, fit_of_run, fit_with
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log
 from kalmark.logs.log_corrections import correct_log
@@ -93,6 +94,22 @@ def test_a_mistake_is_named_and_its_cure_makes_the_log_fit(case: str) -> None:
     assert mistake.name == name
     assert re.search(told, mistake.evidence), mistake.evidence
     assert fit_of_run(run_of(cured(log, mistake))).mean < FITS
+
+
+def test_beacons_above_the_plane_of_their_robot_are_named_with_their_height(tmp_path: Path) -> None:
+    beacons = tmp_path / "beacons.csv"
+    beacons.write_text("id,x_m,y_m\n1,2,2\n2,13,3\n3,14,12\n4,3,14\n")
+    settings = (
+        *CORNERS, "steps=40", "robots.rover.sensors={radio: {type: range, sigma_range_m: 0.05, range_max_m: 30}}",
+        f"filter.map.known={beacons}",
+    )  # fmt: skip
+    log = log_of(measuring(lambda y: np.sqrt(y**2 + 2.0**2)), settings)
+    run = run_of(log, settings)
+    heights = {m.cure.split("=")[1]: m for m in mistakes(run.config, run) if m.name == "height"}
+    right, wrong = (fit_with(log, log.events, heights[z_m]) for z_m in ("-2", "-3"))
+    assert right.mean < FITS < fit_of_run(run).mean
+    assert right.likelihoods.sum() > wrong.likelihoods.sum()
+    assert heights["-2"].cure == "--set robots.rover.sensors.radio.mount.z_m=-2"
 
 
 def test_a_sensor_that_is_turned_over_later_is_named_with_the_time() -> None:

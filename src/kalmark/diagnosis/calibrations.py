@@ -16,7 +16,7 @@ from kalmark.batch.problem import sightings
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
-from kalmark.diagnosis.error_columns import MOST_SCALE, Column, columns_of, rates_of
+from kalmark.diagnosis.error_columns import MOST_SCALE, Column, columns_of, rates_of, stacked
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.tunable_keys import Keys, Path_
 from kalmark.models.observe import view_of
@@ -92,7 +92,7 @@ def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list
 
     The sigmas are by stretches of the run where these vary more than the noise (`causes.systematic`).
     """
-    Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
+    Z, W = stacked(columns)
     have, left = linear.residuals, linear.left(Z, W)
     g, I = Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m
     prior = [KNOWN_TO.get(column.unit, np.inf) if column.name != "range_offset" else np.inf for column in columns]

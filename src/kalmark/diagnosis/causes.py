@@ -16,7 +16,7 @@ from scipy.special import chdtr, chdtrc, chdtri, expit, ndtr
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import LANDMARKS, Ints
 from kalmark.batch.motion_chain import START, UNKNOWN
-from kalmark.diagnosis.error_columns import Column, Where
+from kalmark.diagnosis.error_columns import Column, Where, stacked
 from kalmark.diagnosis.linear import OUT, Left, Linear
 
 BLOCKS = 40  # stretches of a run; the variance of their scores is that of a sum of them
@@ -95,7 +95,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
     """
     if not columns:
         return []
-    Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
+    Z, W = stacked(columns)
     have, left = linear.residuals, linear.left(Z, W)
     g, I = Z.T @ have.r + W.T @ have.m, np.sum(Z * left.r, axis=0) + np.sum(W * left.m, axis=0)
     (block, motion), Q, found = _blocks(linear), linear.root @ linear.root.T, []
@@ -129,7 +129,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
 
 def joint_errors(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
     """Return the systematic errors s (K,), all at once and within their limits, and their information (K, K)."""
-    Z, W = np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
+    Z, W = stacked(columns)
     have, left = linear.residuals, linear.left(Z, W)
     I = Z.T @ left.r + W.T @ left.m
     prior = np.diag([c.most**-2 for c in columns])

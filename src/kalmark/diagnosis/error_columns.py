@@ -53,6 +53,11 @@ def columns_of(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: 
     return [column for column in found if np.isfinite(column.Z).all() and (column.Z.any() or column.W.any())]
 
 
+def stacked(columns: list[Column]) -> tuple[Array, Array]:
+    """Return what one unit of each error adds to the data: Z (N, K) and W (q n, K)."""
+    return np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
+
+
 def errors_of_all_sensors(columns: list[Column]) -> list[Column]:
     """Return the errors that all sensors of a robot may share, where it has several: one laser, one clock."""
     found: dict[tuple[str, str], list[Column]] = {}

@@ -97,13 +97,13 @@ def inverse_depth_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Ar
 @compiled
 def inverse_depth_to_point(l: Array) -> tuple[Array, Array]:
     """Return the Euclidean points p (K, 2) of inverse-depth points l (K, 4), and P_l (K, 2, 4).  [S] (48)."""
-    p, P_l = np.empty((len(l), 2)), np.zeros((len(l), 2, 4))
+    polar = l.copy()
     for i in range(len(l)):
-        d, m_x, m_y = 1.0 / l[i, 3], math.cos(l[i, 2]), math.sin(l[i, 2])
-        p[i, 0], p[i, 1] = l[i, 0] + d * m_x, l[i, 1] + d * m_y
-        P_l[i, 0, 0] = P_l[i, 1, 1] = 1.0
-        P_l[i, 0, 2], P_l[i, 1, 2] = -d * m_y, d * m_x
-        P_l[i, 0, 3], P_l[i, 1, 3] = -d * d * m_x, -d * d * m_y
+        polar[i, 3] = 1.0 / l[i, 3]
+    p, P_l = polar_to_point(polar)
+    for i in range(len(l)):
+        P_l[i, 0, 3] *= -polar[i, 3] * polar[i, 3]
+        P_l[i, 1, 3] *= -polar[i, 3] * polar[i, 3]
     return p, P_l
 
 

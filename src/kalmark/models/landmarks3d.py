@@ -64,20 +64,15 @@ def inverse_depth_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
 @compiled
 def homogeneous_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the rays v (K, 3) to homogeneous points l (K, 4), V_T (K, 3, 6) and V_l (K, 3, 4)."""
-    Q, k = matrix(T[3:]), len(l)
-    v, V_T, V_l = np.zeros((k, 3)), np.empty((k, 3, 6)), np.zeros((k, 3, 4))
-    ray = np.empty(3)
-    for i in range(k):
-        rho = l[i, 3]
+    anchored, V_l = np.zeros((len(l), 7)), np.empty((len(l), 3, 4))  # at the origin
+    for i in range(len(l)):
+        for a in range(4):
+            anchored[i, 3 + a] = l[i, a]
+    v, V_T, V_anchored = anchored_seen_from(T, anchored)
+    for i in range(len(l)):
         for a in range(3):
-            ray[a] = l[i, a] - rho * T[a]
-        for j in range(3):
-            for a in range(3):
-                b, c = (a + 1) % 3, (a + 2) % 3
-                v[i, j] += Q[a, j] * ray[a]
-                V_l[i, j, 3] -= Q[a, j] * T[a]
-                V_l[i, j, a] = Q[a, j]
-                V_T[i, j, a], V_T[i, j, 3 + a] = -rho * Q[a, j], Q[b, j] * ray[c] - Q[c, j] * ray[b]
+            for b in range(4):
+                V_l[i, a, b] = V_anchored[i, a, 3 + b]
     return v, V_T, V_l
 
 
