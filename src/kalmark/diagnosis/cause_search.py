@@ -80,6 +80,7 @@ class Search:
         at = np.searchsorted(linear.problem.nodes[order], poses)  # a pose at a fix has the time of the next scan
         self.t_s = ((t_ns - t_ns[:1].sum()) * 1e-9)[order[np.minimum(at, len(order) - 1)]]
         self.found: list[Finding] = []
+        self.suspects: list[Finding] = []  # systematic errors that explain most at first, sure or not
         self.simulated = linear.simulated(causes.SETS)
 
     def run(self, progress: bool = False) -> list[Finding]:
@@ -93,6 +94,9 @@ class Search:
         rounds, lasting = ROUNDS + MORE, False
         for n in track(range(rounds), "causes, one after the other", rounds, show=progress):
             candidates = self.candidates()
+            if n == 0:
+                steady = [f for f in candidates if f.is_steady and f.gain > LEAST_GAIN]
+                self.suspects = sorted(steady, key=lambda f: -f.gain)
             least = max(LEAST_GAIN, SHARE * sum(f.gain for f in self.found) if n >= ROUNDS else 0.0)
             sure = self._sure(candidates, least)
             harmful = [] if lasting else [f for f in sure if not f.overstated]

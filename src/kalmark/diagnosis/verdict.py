@@ -189,13 +189,13 @@ def _with_cure(
 
     That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
     """
-    steady = _steady(verdict.search)
+    tried = _suspects(verdict.search, TRIED)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
-    doubted |= any(f.name == LATE or f.begins for f in steady[:TRIED])  # whose sizes are so far from linear
+    doubted |= any(f.name == LATE or f.begins for f in tried)  # whose sizes are so far from linear
     if len(run.history.d2) > AT_ONCE or not doubted:
         return verdict
-    tried = [*also, *steady[:TRIED], *_of_less_certain_controls(run, log, most, progress)]
+    tried = [*also, *tried, *_of_less_certain_controls(run, log, most, progress)]
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
     for n in range(ROUNDS):
         cured = [without_error(*at, f) for f in tried]
@@ -206,7 +206,7 @@ def _with_cure(
         taken[key] = joined([*have, replace(one, gain=gain)])
         at = without, changed
         rest = _judged(*at, _structural(*at, []), most, progress)
-        tried = _steady(rest.search)[:1]
+        tried = _suspects(rest.search, 1)
         if fit_of_run(without).mean > MISFITS_ALL:
             tried += _of_less_certain_controls(*at, most, progress)
     if not taken:
@@ -230,6 +230,13 @@ def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> 
     except (KalmarkError, np.linalg.LinAlgError):
         return ()
     return tuple(f for f in _steady(search) if f.unit != TIMES)[:TRIED]
+
+
+def _suspects(search: Search | None, most: int) -> list[Finding]:
+    """Return the likeliest errors of a search that are tried: so many that are sure, and the first that may be."""
+    sure = _steady(search)[:most]
+    may_be = search.suspects[:1] if search else []
+    return sure + [f for f in may_be if (f.name, f.of) not in [(one.name, one.of) for one in sure]]
 
 
 def _steady(search: Search | None) -> list[Finding]:
