@@ -233,10 +233,10 @@ def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> 
 
 
 def _suspects(search: Search | None, most: int) -> list[Finding]:
-    """Return the likeliest errors of a search that are tried: so many that are sure, and the first that may be."""
+    """Return the likeliest errors of a search that are tried: so many that are sure, and one that may explain more."""
     sure = _steady(search)[:most]
     may_be = search.suspects[:1] if search else []
-    return sure + [f for f in may_be if (f.name, f.of) not in [(one.name, one.of) for one in sure]]
+    return sure + [f for f in may_be if all(f.gain > one.gain for one in sure)]
 
 
 def _steady(search: Search | None) -> list[Finding]:
