@@ -70,16 +70,18 @@ def _passing(linear: Linear, column: Column, t_s: Array) -> Iterator[Finding]:
         np.where((begin_s <= of_s) & (of_s < end_s), part, 0.0)
         for of_s, part in ((row_s, column.Z), (step_s, column.W))
     )
-    part = column._replace(Z=Z, W=W, most=1.0 if W.any() and not column.unit else column.most)  # wheels that spin
+    part = column._replace(Z=Z, W=W, most=math.inf if W.any() else column.most)  # wheels may spin
     for one in systematic(linear, [part]):
         variance = linear.root.power(2).sum(axis=1)
         by_steps = W[variance > 0.0] ** 2 / variance[variance > 0.0]
         shown = np.concatenate([Z[Z != 0.0] ** 2, by_steps[by_steps != 0.0]]) * one.value**2
         if float(shown.mean()) > SHOWS**2:
             p = min(1.0, one.p * len(times) * (1 if end_s == math.inf else len(times)))
-            if W.any():  # an error of a step begins and ends at the pose before
-                begin_s, end_s = (t_s[t_s < s].max(initial=0.0) if s < math.inf else s for s in (begin_s, end_s))
-            yield replace(one, p=p, since_s=float(begin_s), until_s=float(end_s))
+            if W.any():  # an error of a step begins and ends at the pose before, in the same segment of the run
+                usual_s = float(np.median(np.diff(np.unique(t_s))))
+                begin_s = max(float(t_s[t_s < begin_s].max(initial=0.0)), begin_s - usual_s)
+                end_s = float(t_s[t_s < end_s].max()) if end_s < math.inf else end_s
+            yield replace(one, p=p, since_s=begin_s, until_s=end_s)
 
 
 def turned_mounts(linear: Linear) -> Iterator[Column]:
@@ -169,7 +171,7 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
     robot, second, *rest = finding.of
     of, s, first_s = run.final_slam().robots[robot], finding.value, float(run.history.t_ns[0]) * 1e-9
     begin_s, end_s = (first_s + (t or 0.0) for t in (finding.since_s, finding.until_s))
-    is_control = rest[-1:] in (["scale"], ["offset"], ["per_way"])
+    is_control = rest[-1:] in (["scale"], ["offset"])
     names = of.motion.columns if is_control else of.sensors[second].sensor.columns if second in of.sensors else ()
     wanted = (second,) if is_control else BEARINGS if finding.name == TURNED else tuple(rest)
     k = [names.index(name) for name in wanted if name in names]
@@ -180,9 +182,7 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
     def changed(a: Array) -> Array:
         a = a.copy()
         if finding.name.endswith("scale"):
-            a[..., k] *= 1.0 + s if is_control else 1.0 / (1.0 + s)
-        elif rest[-1:] == ["per_way"]:
-            a[..., k] += s * np.abs(a[..., :1])
+            a[..., k] /= 1.0 - s if is_control else 1.0 + s  # s is a share of the control as it was estimated
         elif is_control:
             a[..., k] += s * (1.0 if of.motion.held else float(np.median(each_s)))
         else:

@@ -197,19 +197,19 @@ def _with_cure(
         return verdict
     tried = [*also, *tried, *_of_less_certain_controls(run, log, most, progress)]
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
-    for n in range(ROUNDS):
+    for _ in range(ROUNDS):
         cured = [without_error(*at, f) for f in tried]
         gain, without, changed, one = max(cured, key=lambda of: of[0], default=(0.0, *at, None))
-        if one is None or gain < max(LEAST_GAIN, 0.0 if n else least):
+        if one is None or gain < LEAST_GAIN:
             break
-        have = [taken[key]] if (key := (one.name, *one.of, str(one.begins))) in taken else []
+        have = [taken[key]] if (key := (one.name, *one.of, str(one.since_s))) in taken else []
         taken[key] = joined([*have, replace(one, gain=gain)])
         at = without, changed
         rest = _judged(*at, _structural(*at, []), most, progress)
         tried = _suspects(rest.search, 1)
         if fit_of_run(without).mean > MISFITS_ALL:
             tried += _of_less_certain_controls(*at, most, progress)
-    if not taken:
+    if not taken or sum(one.gain for one in taken.values()) < least:
         return verdict
     causes = [_cause(run, f, log) for f in taken.values()]
     left = [c for c in rest.causes if c.name not in [f.name for f in taken.values()]]
