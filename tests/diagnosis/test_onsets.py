@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +15,9 @@ from kalmark.batch.data import replay_events
 from kalmark.batch.problem import sightings
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.batch_search import associated
+from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.onsets import _turns
+from kalmark.diagnosis.onsets import _turns, without_onset
 from kalmark.events import Control, Scan
 from kalmark.geometry.frames import compose
 from kalmark.geometry.frames3d import compose as compose3d
@@ -75,6 +77,39 @@ def test_wheels_that_slip_for_a_while_are_named_first_with_both_times(ids: bool)
     assert cause.cure == ""
     if not ids:
         assert associated(run, log_of_run(run)) is not run, "associations of less certain controls"
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "value", "changed"),
+    [
+        ("odometry_scale", ("rover", "v_mps", "scale"), -0.25, lambda u: u / [1.25, 1.0]),
+        ("odometry_turn", ("rover", "w_radps", "scale"), 0.2, lambda u: u / [1.0, 0.8]),
+        ("odometry_turn", ("rover", "w_radps", "offset"), 0.1, lambda u: u - [0.0, -0.1]),
+        ("range_scale", ("rover", "lidar", "range_m"), 0.1, lambda y: y / [1.1, 1.0]),
+        ("range_offset", ("rover", "lidar", "range_m"), 0.3, lambda y: y - [0.3, 0.0]),
+        ("mount", ("rover", "lidar"), 0.2, lambda y: y - [0.0, -0.2]),
+        ("time_offset", ("rover", "lidar"), 0.2, None),
+        ("mount_position", ("rover", "lidar", "x_m"), 0.2, None),
+    ],
+)
+def test_an_error_is_taken_out_of_its_part_of_a_log_alone(name: str, of: tuple[str, ...], value: float, changed: Any
+) -> None:  # fmt: skip
+    world = load_world("random_field", (*PLANE, "steps=40"))
+    log = simulate(world, 3)
+    run = km.record(build_slam(world.config(), log), log, progress=False, pictures=False)
+    without = without_onset(run, log, Finding(name, of, 0.0, 0.0, value, since_s=2.0, until_s=4.0))
+    if changed is None:
+        assert without is None
+        return
+    assert without is not None
+    begin_s, kind = float(run.history.t_ns[0]) * 1e-9, "u" if name.startswith("odometry") else "y"
+    for e, other in zip(log.events, without.events, strict=True):
+        for key in ("u", "y"):
+            if not hasattr(e, key) or not len(getattr(e, key)):
+                continue
+            within = key == kind and begin_s + 2.0 <= e.t_s < begin_s + 4.0
+            have = getattr(e, key)
+            np.testing.assert_allclose(getattr(other, key), changed(have) if within else have)
 
 
 def test_the_associations_of_a_run_that_fits_are_those_it_has() -> None:

@@ -27,7 +27,6 @@ from kalmark.results.run import Run
 TURNED = "mount"  # the cause that a sensor was turned
 STRETCHES, ROUNDS = 20, 4  # in which the time is looked for, and how often within the best of them
 TRIED = 3  # errors whose time is looked for
-BEARINGS = ("bearing_rad", "azimuth_rad")
 
 
 def find_onsets(linear: Linear, columns: list[Column], t_s: Array) -> list[Finding]:
@@ -167,21 +166,24 @@ def _gains(linear: Linear, column: Column, row_s: Array, step_s: Array, edges: A
 
 # ------------------------------------------------------------------ the log without it
 def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
-    """Return a log without an error in a part of it, of a column of a sensor or of the controls; None of others."""
+    """Return a log without an error in a part of it, of a column of a sensor or of the controls; None of others.
+
+    Those of a mount are a turn in the plane.
+    """
     robot, second, *rest = finding.of
     of, s, first_s = run.final_slam().robots[robot], finding.value, float(run.history.t_ns[0]) * 1e-9
     begin_s, end_s = (first_s + (t or 0.0) for t in (finding.since_s, finding.until_s))
     is_control = rest[-1:] in (["scale"], ["offset"])
     names = of.motion.columns if is_control else of.sensors[second].sensor.columns if second in of.sensors else ()
-    wanted = (second,) if is_control else BEARINGS if finding.name == TURNED else tuple(rest)
+    wanted = [second] if is_control else ["bearing_rad"] if finding.name == TURNED else rest
     k = [names.index(name) for name in wanted if name in names]
-    if not k:
+    if not k or finding.name == "mount_position":
         return None
     each_s = np.diff([e.t_s for e in log.events if isinstance(e, Control) and e.robot == robot])
 
     def changed(a: Array) -> Array:
         a = a.copy()
-        if finding.name.endswith("scale"):
+        if finding.name == "range_scale" or rest[-1:] == ["scale"]:
             a[..., k] /= 1.0 - s if is_control else 1.0 + s  # s is a share of the control as it was estimated
         elif is_control:
             a[..., k] += s * (1.0 if of.motion.held else float(np.median(each_s)))
