@@ -85,6 +85,10 @@ class Asked:
         """Return d2 (K, L) from these landmarks."""
         return self.points.distances()[:, [self.names.index(name) for name in candidates]]
 
+    def class_distances(self, names: list[Any]) -> Array:
+        """Return that no class is reported."""
+        return np.zeros((len(self.y), len(names)))
+
     def jointly(self, rows: Index, names: list[Any]) -> tuple[Array, Array]:
         """Return z (M, 2) and Z (2 M, 2 M) of pairs."""
         return self.points.innovation(rows, [self.names.index(name) for name in names])

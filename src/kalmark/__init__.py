@@ -34,14 +34,15 @@ if TYPE_CHECKING:
     from kalmark.results.run import Run
     from kalmark.slam.robot import Mount, Robot
     from kalmark.slam.slam import Slam
+    from kalmark.tracks.classes import Classes
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Attention", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount", "Observation",
-    "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "association", "detect", "draw", "estimators", "geometry",
-    "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record", "register",
-    "sensors", "stream_log", "textbook",
+    "Attention", "Classes", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount",
+    "Observation", "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "association", "detect", "draw", "estimators",
+    "geometry", "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record",
+    "register", "sensors", "stream_log", "textbook",
 ]  # fmt: skip
 
 _MODULES = {
@@ -70,6 +71,7 @@ _NAMES = {
     "kalmark.results.run": ("Run",),
     "kalmark.slam.robot": ("Mount", "Robot"),
     "kalmark.slam.slam": ("Slam",),
+    "kalmark.tracks.classes": ("Classes",),
 }
 
 

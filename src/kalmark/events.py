@@ -207,6 +207,15 @@ def checked_ids(ids: Any, count: int) -> tuple[Id | None, ...]:
     return ids
 
 
+def checked_classes(classes: Any, count: int) -> tuple[str | None, ...]:
+    """Return the classes of the observations of one scan (None: not reported), refusing all but as many texts."""
+    given = list(classes) if isinstance(classes, list | tuple | np.ndarray) else []
+    if len(given) != count:
+        wanted = f"a list with one text or None for each of {count} observations"
+        raise EventError(f"classes is {short_text(classes)}, expected {wanted}")
+    return tuple([None if each is None else str(checked_id(_text(each, "a class"), "a class")) for each in given])
+
+
 def _text(value: Any, what: str) -> str:
     if not isinstance(value, str):
         raise EventError(f"{what} is {short_text(value)}, expected a text")
@@ -291,7 +300,8 @@ class Scan(_Timed):
     """A scan of one sensor of one robot at one instant: K observations `y` of shape (K, m).
 
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
-    overrides the noise of the sensor model.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
+    overrides the noise of the sensor model.  `classes` are what the sensor reports of each (None: nothing),
+    which count where its mount has `km.Classes`.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
     `width` is the m it was given, 0 for (), `largest` the largest magnitude in `y`, `largest_cov` in `cov`.
 
     >>> km.Scan(t_s=0.5, robot="rover", sensor="lidar", y=[[4.2, 0.3], [2.0, -0.1]], ids=[7, None]).ids
@@ -304,6 +314,7 @@ class Scan(_Timed):
     y: Array
     ids: tuple[Id | None, ...] | None
     cov: Array | None
+    classes: tuple[str | None, ...] | None
     width: int = field(init=False, repr=False)
     largest: float = field(init=False, repr=False)
     largest_cov: float = field(init=False, repr=False)
@@ -318,6 +329,7 @@ class Scan(_Timed):
         cov: Any = None,
         *,
         t_ns: int | None = None,
+        classes: Any = None,
     ) -> None:
         set_ = object.__setattr__
         t_ns = time_in_ns(t_s, t_ns, "scan", robot)
@@ -331,6 +343,7 @@ class Scan(_Timed):
             set_(self, "width", y.shape[1])
             set_(self, "y", y if len(y) else y.reshape(0, 0))
             set_(self, "ids", None if ids is None else checked_ids(ids, len(y)))
+            set_(self, "classes", None if classes is None else checked_classes(classes, len(y)))
             cov, largest_cov = (None, 0.0) if cov is None else finite_and_largest(cov, "cov", MOST_OTHER**2)
             set_(self, "cov", cov)
             set_(self, "largest_cov", largest_cov)

@@ -96,7 +96,7 @@ def test_branch_and_bound_finds_what_a_look_at_all_matchings_finds() -> None:
         )
         A = rng.normal(size=(2 * total, 2 * total + 3))
         Z, z = A @ A.T / (2 * total + 3), rng.normal(size=(total, 2)) * 1.6
-        chosen, finished = best_matching(first, landmark, z, Z, gates, 100_000)
+        chosen, finished = best_matching(first, landmark, z, Z, np.zeros(len(landmark)), gates, 100_000)
         assert finished
         best = (0, 0.0)
         for pairs in itertools.product(*[[-1, *range(a, b)] for a, b in itertools.pairwise(first)]):
@@ -350,7 +350,7 @@ def prefix_fits(used: list[int], z: np.ndarray, Z: np.ndarray, gates: np.ndarray
 def test_a_search_that_is_cut_short_gives_what_it_has() -> None:
     first, landmark = np.array([0, 2, 4]), np.array([0, 1, 0, 1])
     z, Z = np.zeros((4, 1)), np.eye(4)
-    chosen, finished = best_matching(first, landmark, z, Z, np.full(3, 9.0), 3)
+    chosen, finished = best_matching(first, landmark, z, Z, np.zeros(len(landmark)), np.full(3, 9.0), 3)
     assert not finished
     assert (chosen >= 0).sum() <= 2
 

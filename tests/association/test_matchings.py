@@ -83,12 +83,18 @@ Z_LINE, INNOVATIONS = np.ones((3, 3)) + 0.01 * np.eye(3), np.array([[-0.9], [1.1
 
 def test_a_shift_that_is_common_to_two_observations_pairs_both_with_what_is_not_nearest() -> None:
     """Landmarks at 0 and 2 seem to be at 1.1 and 3.1: the joint d2 of the shift is 2 x 1.1^2 / 2.01 = 1.204."""
-    chosen, finished = best_matching(FIRST, LANDMARK, INNOVATIONS, Z_LINE, np.array([0.0, 9.0, 1.205]), 100)
+    chosen, finished = best_matching(
+        FIRST, LANDMARK, INNOVATIONS, Z_LINE, np.zeros(len(LANDMARK)), np.array([0.0, 9.0, 1.205]), 100
+    )
     assert finished and chosen.tolist() == [1, 2]
 
 
 def test_where_no_two_pairs_fit_the_one_of_least_d2_is_taken() -> None:
-    chosen, _ = best_matching(FIRST, LANDMARK, INNOVATIONS, Z_LINE, np.array([0.0, 9.0, 1.203]), 100)
+    chosen, _ = best_matching(
+        FIRST, LANDMARK, INNOVATIONS, Z_LINE, np.zeros(len(LANDMARK)), np.array([0.0, 9.0, 1.203]), 100
+    )
     assert chosen.tolist() == [0, -1]  # .81 / 1.01, the others 1.21 / 1.01
-    chosen, _ = best_matching(FIRST, LANDMARK, INNOVATIONS, Z_LINE, np.array([0.0, 0.8, 0.8]), 100)
+    chosen, _ = best_matching(
+        FIRST, LANDMARK, INNOVATIONS, Z_LINE, np.zeros(len(LANDMARK)), np.array([0.0, 0.8, 0.8]), 100
+    )
     assert chosen.tolist() == [-1, -1]

@@ -8,7 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
+import kalmark as km
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.plot import draw_map
 from kalmark.results.record import record
 from kalmark.results.run import Run
@@ -71,3 +73,18 @@ def test_an_own_landmark_is_written_and_drawn_where_it_is(model: Any, mean: Any,
     (axes,) = draw_map(loaded).axes
     assert np.isfinite(axes.get_xlim()).all()
     assert loaded.evaluate() == run.evaluate()
+
+
+def test_the_likeliest_class_of_a_landmark_is_in_its_row_and_in_the_picture(tmp_path: Path) -> None:
+    lidar = km.Mount(km.sensors.RangeBearing(), classes=km.Classes(("blue", "yellow"), error=0.1))
+    slam = km.Slam(km.Robot("r", km.motion.Unicycle(), sensors={"lidar": lidar}))
+    slam.process(
+        km.Scan(0.0, "r", "lidar", [[4.0, 0.3], [2.0, -1.0], [3.0, 0.0]], [7, 8, 9], classes=["blue", "yellow", None])
+    )
+    landmarks = MapLandmarks.of(slam)
+    (tmp_path / "landmarks.csv").write_text(landmarks.to_csv())
+    back = MapLandmarks.read(tmp_path / "landmarks.csv")
+    assert back.classes == {7: ("blue", pytest.approx(0.9)), 8: ("yellow", pytest.approx(0.9))}
+    assert back.to_csv() == landmarks.to_csv()
+    labels = km.draw(slam).get_legend_handles_labels()[1]
+    assert {"blue", "yellow"} <= {*labels}

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import kalmark as km
 from kalmark.config.opening import merge_trees
 from kalmark.errors import ConfigError
 from kalmark.simulate import World, load_world, shipped_worlds, simulate
@@ -24,7 +25,9 @@ from kalmark.simulate.layouts import (
     RandomField,
     TagRoom,
     ThickCloister,
+    along_closed_line,
 )
+from kalmark.simulate.robots import simulation
 from kalmark.simulate.routes import Constant, Lanes, Wander, Waypoints, control_of_velocity
 from kalmark.simulate.sights import SimulatedSensing
 from kalmark.simulate.worlds import SimulatedRobot
@@ -83,6 +86,41 @@ def test_a_random_field_fills_its_square() -> None:
     points = RandomField(count=2000, size_m=30.0).place(np.random.default_rng(0))
     assert points.min() >= 0 and points.max() <= 30
     assert np.abs(points.mean(axis=0) - 15).max() < 1.0
+
+
+def test_cones_stand_on_both_sides_of_a_race_track_and_are_reported_by_their_classes() -> None:
+    world = load_world("race_track", ["steps=400"])
+    things = world.world.scenery(np.random.default_rng(0))
+    assert things.classes is not None
+    assert np.bincount(things.classes).tolist() == [78, 78, 4]
+    middle, left = along_closed_line(np.array(world.world.line_m), 4.0)
+    sides = [things.points[things.classes == k] - middle[1:] for k in (0, 1)]
+    np.testing.assert_allclose(np.sum(sides[0] * left[1:], axis=1), 1.75)
+    np.testing.assert_allclose(sides[1], -sides[0], atol=1e-9)
+    found, wrong = simulation(world, 3), []
+    for scan in (e for e in found.log if isinstance(e, km.Scan)):
+        assert scan.classes is not None
+        truth = found.origins[scan.t_ns, "car", "lidar"]
+        wrong += [
+            of != ("blue", "yellow", "orange")[things.classes[i - 1]] for of, i in zip(scan.classes, truth, strict=True)
+        ]
+    assert 0.03 < np.mean(wrong) < 0.07
+
+
+def test_a_lag_is_drawn_and_scans_are_stamped_late_by_it() -> None:
+    late = []
+    for seed in range(30):
+        log = simulate(load_world("race_track", ["steps=4"]), seed)
+        late.append(min(e.t_s for e in log if isinstance(e, km.Scan)) % 0.05 + 0.0)
+    first = [
+        min(
+            e.t_s
+            for e in simulate(load_world("race_track", ["steps=4", "robots.car.sensing.lidar.late_s=0.5"]), 0)
+            if isinstance(e, km.Scan)
+        )
+    ]
+    assert np.std(late) > 0.005
+    assert first[0] > 0.55
 
 
 def test_every_shipped_world_simulates_and_gives_its_filter_the_simulated_noise() -> None:

@@ -30,7 +30,7 @@ from kalmark.slam.state import Settings
 
 ROLES = (
     *("motion", "sensor", "landmark", "association", "estimator"),
-    *("detector", "initialization", "attention", "upkeep"),
+    *("detector", "initialization", "attention", "upkeep", "classes"),
 )
 MODELS = [(role, each) for role in ROLES for each in built_in(role)]
 SECTIONS: dict[Any, dict[str, Any]] = {
@@ -54,6 +54,10 @@ def values(own: Parameter) -> Iterator[Any]:
             yield value
     if own.type is bool:
         yield not own.default
+    if get_args(own.type)[:1] == (str,):
+        yield ("blue", "yellow")
+    if own.name == "confusion":
+        yield (0.75, 0.25, 0.125, 0.875)
 
 
 def changed(kind: Any, name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -9,9 +10,11 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.config import build_slam
 from kalmark.events import Event
 from kalmark.geometry import compose, inverse
 from kalmark.geometry.angles import wrap
+from kalmark.simulate import load_world, simulate
 
 RANGE_M, RATE_HZ = 8.0, 5.0
 
@@ -112,6 +115,22 @@ def test_trees_that_were_felled_do_not_carry_a_robot() -> None:
     off, carried = errors(slam_at(poses[0], False), log_of(poses, places, 6, False, felled=550), poses[1:])
     assert not carried
     assert off.max() < 0.8
+
+
+def test_the_onset_is_found_although_the_way_led_through_an_empty_place_first() -> None:
+    """A car spins by 2 rad, maps 100 cones again where there are none, and only then misses those that are there."""
+    log = simulate(load_world("race_track"), 0)
+    slam, carried = build_slam(load_world("race_track", ["filter.upkeep.repeats=off"]).config(), log), list[Any]()
+    for event in log:
+        during = 55.0 <= event.t_s < 57.0
+        if isinstance(event, km.Control) and during:
+            carried += slam.process(replace(event, u=event.u * [0.6, 1.0] - [0.0, 1.0])).gaps
+        elif not during:
+            carried += slam.process(event).gaps
+    assert [gap.kind for gap in carried] == ["elsewhere"]
+    assert 54.0 < carried[0].start_ns * 1e-9 < 60.0
+    assert carried[0].end_ns * 1e-9 > 65.0
+    assert len(slam.landmarks()) <= len(log.landmarks) + 1
 
 
 def test_two_things_with_one_id_and_one_that_drives_about_bend_no_map() -> None:

@@ -184,9 +184,11 @@ class JointCompatibility(Gated):
         pairs = np.full(len(d2), -1)
         if not len(columns):
             return Matched(pairs, {})
-        z, Z = query.jointly(np.repeat(open_[order], np.diff(first)), [names[c] for c in columns.tolist()])
+        rows = np.repeat(open_[order], np.diff(first))
+        z, Z = query.jointly(rows, [names[c] for c in columns.tolist()])
+        more = query.class_distances(names)[rows, columns]
         gates = np.array([0.0, *(chi2_gate(self.gate, z.shape[1] * (n + 1)) for n in range(len(d2)))])
-        chosen, finished = best_matching(first, columns, z, Z, gates, self.most_nodes)
+        chosen, finished = best_matching(first, columns, z, Z, more, gates, self.most_nodes)
         pairs[order] = np.where(chosen >= 0, columns[chosen], -1)
         why = "it does not fit with the others" + ("" if finished else f", as far as {self.most_nodes} nodes tell")
         return Matched(pairs, dict.fromkeys(range(len(d2)), why))

@@ -145,13 +145,14 @@ def extend(L: Array, w: Array, z: Array, Z: Array, chosen: Index, count: int, m:
 
 @compiled
 def best_matching(  # noqa: C901 - one compiled loop: a recursion without calls
-    first: Index, landmark: Index, z: Array, Z: Array, gates: Array, most: int
+    first: Index, landmark: Index, z: Array, Z: Array, more: Array, gates: Array, most: int
 ) -> tuple[Index, bool]:
     """Return the pair chosen for each of K observations (-1: none), and whether the search was finished.
 
     The pairs of observation i are first[i] to first[i + 1] - 1, best first; pair m is with landmark[m], has the
-    innovation z[m] (p,), and Z (M p, M p) is the covariance of all of them.  As many pairs as possible with a joint d2
-    of at most gates[number of pairs]; among those the smallest d2.  After `most` nodes the best so far is returned.
+    innovation z[m] (p,), adds `more` (M,) to d2, and Z (M p, M p) is the covariance of all of them.  As many pairs as
+    possible with a joint d2 of at most gates[number of pairs]; among those the smallest d2.  After `most` nodes the
+    best so far is returned.
     """
     k, p = len(first) - 1, z.shape[1]
     L, w = np.zeros((k * p, k * p)), np.zeros(k * p)
@@ -180,7 +181,7 @@ def best_matching(  # noqa: C901 - one compiled loop: a recursion without calls
                 free = free and landmark[chosen[c]] != landmark[m]
             if not free:
                 continue
-            d2[i + 1] += extend(L, w, z, Z, chosen, count, m, p)
+            d2[i + 1] += more[m] + extend(L, w, z, Z, chosen, count, m, p)
             if not d2[i + 1] <= gates[count + 1]:
                 continue
         could = count + (not skip) + rest[i + 1]

@@ -105,7 +105,8 @@ class Query:
         """
         scan, channel, tracks = self.scan, self.scan.channel, self.scan.tracks
         model = tracks.only_model(channel)
-        plain = scan.event.ids is None and not (tracks.tentative or self._known or channel.joins or scan.noise_varies)
+        varied = channel.joins or scan.noise_varies or scan.reported is not None
+        plain = scan.event.ids is None and not (tracks.tentative or self._known or varied)
         if model is None or not plain or not isinstance(model.model, tuple):
             return None
         p = channel.places(scan.map, scan.robot, scan.y)
@@ -136,8 +137,12 @@ class Query:
     def distances(self, candidates: list[Id]) -> Array:
         """Return the squared Mahalanobis distances (K, L) of the observations from the candidates.  [S] (83).
 
-        inf where a candidate is not near an observation.
+        inf where a candidate is not near an observation.  A class that is reported adds what it is unlikely
+        (`tracks/classes.py`).
         """
+        return self._distances(candidates) + self.class_distances(candidates)
+
+    def _distances(self, candidates: list[Id]) -> Array:
         d2 = np.full((len(self.y), len(candidates)), np.inf)
         if self._pairs is None:
             rows, numbers = (a.ravel() for a in np.indices(d2.shape))
@@ -179,6 +184,10 @@ class Query:
                 )
         return out
 
+    def class_distances(self, names: list[Id]) -> Array:
+        """Return how much of the squared distances (K, L) from landmarks is of the classes that are reported."""
+        return self.scan.class_distances(names)[0]
+
     # ------------------------------------------------------------------ jointly
     def jointly(self, rows: Index, names: list[Id]) -> tuple[Array, Array]:
         """Return the innovations z (M, p) of M pairs of an observation and a landmark, and their Z (M p, M p).
@@ -216,14 +225,15 @@ class Query:
             at = {name: i for i, name in enumerate(self._names)}
             read = read._replace(slots=read.slots[[at[n] for n in names]]) if at.keys() >= set(names) else None
         model = scan.channel.models[str(sorts.pop())]
-        return Candidates(scan, model, self.read(names) if read is None else read)
+        return Candidates(scan, model, self.read(names) if read is None else read, names)
 
 
 class Candidates:
     """Landmarks of one kind that a scan may show, for joint queries; `read` is a joint marginal that has them."""
 
-    def __init__(self, scan: ScanContext, model: ObservationModel, read: Marginal) -> None:
+    def __init__(self, scan: ScanContext, model: ObservationModel, read: Marginal, names: list[Id]) -> None:
         self._scan, self._model, self._read = scan, model, read
+        self._of_classes, self._of_new = scan.class_distances(names)
 
     def places(self) -> Places:
         """Return where all observations seem to be from the sensor (K, n), where the landmarks are, and covariances."""
@@ -242,7 +252,7 @@ class Candidates:
         run = corrections.compiled_fit if isinstance(model.model, tuple) else corrections.scan_fit
         scan = robot, mount, here[columns], model.d, y, np.ascontiguousarray(R), np.inf
         d2, log_det = run(model.model, m.whole, scan, LIMITS)
-        return float(d2), float(log_det)
+        return float(d2 + self._of_classes[rows, columns].sum()), float(log_det)
 
     def log_volume_ratio(self, rows: Index, columns: Index) -> Array:
         """Return log |Z| / |R| (M,) of each pair: twice the information that the measurement gives."""
@@ -256,10 +266,12 @@ class Candidates:
     def log_density(self, rows: Index) -> Array:
         """Return the logarithm of the density of landmarks where observations (M,) seem to be, in their units.
 
-        That of the landmarks nearest to there, but for the one that an observation may be of.
+        That of the landmarks nearest to there, but for the one that an observation may be of; of those of the class
+        that is reported.
         """
         scan, channel, n = self._scan, self._scan.channel, self._scan.dimensions
         v, V, l, _ = self.places()
         p = channel.landmark.from_view(scan.pose(), channel.calibrated(scan.map).invert(scan.y[rows])[0])[0]
         gaps = np.sort(np.linalg.norm(p[:, None, :n] - l, axis=2), axis=1)[:, 1 : NEIGHBOURS + 1]
-        return log_density(gaps, np.linalg.norm(v[rows], axis=1), n) + log_volume_change(V[rows], scan.R[rows])
+        found = log_density(gaps, np.linalg.norm(v[rows], axis=1), n) + log_volume_change(V[rows], scan.R[rows])
+        return found - 0.5 * self._of_new[rows]

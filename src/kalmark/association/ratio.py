@@ -116,6 +116,8 @@ def defer_doubtful_pairs(query: Query, decisions: list[Decision], odds: float) -
     V_y = scan.channel.sensor.invert(scan.y[rows])[1][:, : scan.dimensions]
     change = log_volume_change(V_y @ scan.R[rows] @ V_y.swapaxes(1, 2), scan.R[rows])
     chance = log_density_about(scan.map, tracks, names, scan.pose()) + change
+    of_pairs, of_new = scan.class_distances(names)
+    chance += 0.5 * (of_pairs[rows, np.arange(len(rows))] - of_new[rows])
     found = log_ratios(z, Z, chance, len(sure))
     out, at = list(decisions), dict(zip(found.order, found.ratio.tolist(), strict=True))
     for i in doubtful_pairs(found, len(sure), odds):

@@ -18,6 +18,7 @@ string robot
 string sensor
 string[] columns
 string[] ids
+string[] classes
 float64[] values
 float64[] covariance
 """

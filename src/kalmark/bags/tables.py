@@ -74,8 +74,9 @@ def _plain(value: Any) -> Any:
 
 
 def record_message(
-    topic: str, t_ns: int, robot: str, values: Any, sensor: str = "", columns: Any = (), ids: Any = (), cov: Any = None
-) -> Outgoing:
+    topic: str, t_ns: int, robot: str, values: Any, sensor: str = "", columns: Any = (), ids: Any = (), cov: Any = None,
+    classes: Any = (),
+) -> Outgoing:  # fmt: skip
     """Return one kalmark_msgs/Record."""
     fields = {
         "header": header_fields(t_ns, robot),
@@ -84,7 +85,7 @@ def record_message(
         "sensor": sensor,
         "columns": list(columns),
     }
-    fields |= {"ids": list(ids), "values": values, "covariance": () if cov is None else cov}
+    fields |= {"ids": list(ids), "classes": list(classes), "values": values, "covariance": () if cov is None else cov}
     return Outgoing(topic, RECORD, t_ns, fields)
 
 
@@ -100,7 +101,8 @@ def record_of_event(log: Log, event: Event) -> Outgoing:
         raise LogError(f"{label_of_event(event)}: raw data, expected controls, scans and fixes")
     columns = log.sensor_columns.get((event.robot, event.sensor), ())
     ids = ["" if id_ is None else id_text(id_) for id_ in event.ids or ()]
-    return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov)
+    classes = [of or "" for of in event.classes or ()]
+    return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov, classes)
 
 
 def pose_records(robot: str, path: Trajectory) -> Iterator[Outgoing]:
@@ -167,4 +169,5 @@ def event_of_message(received: Received) -> Event:
     if cov is not None:
         cov = cov.reshape(size, size) if len(cov) == size * size and len(y) > 1 else cov.reshape(len(y), size, size)
     ids = [landmark_id(text) if text else None for text in m.ids] if len(m.ids) else None
-    return Scan(t_ns=int(m.t_ns), robot=m.robot, sensor=m.sensor, y=y, ids=ids, cov=cov)
+    classes = [of or None for of in getattr(m, "classes", ())] or None  # an older file has none
+    return Scan(t_ns=int(m.t_ns), robot=m.robot, sensor=m.sensor, y=y, ids=ids, cov=cov, classes=classes)

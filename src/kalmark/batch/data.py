@@ -21,7 +21,7 @@ from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES
 from kalmark.batch.motion_chain import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
 from kalmark.batch.wall_anchors import anchors
-from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event
+from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event, sort_events
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import mount_space
 from kalmark.models.landmarks import Point2D, Wall2D
@@ -117,6 +117,34 @@ def replay_events(given: BatchInput, events: Iterable[Event]) -> Problem:
     return BatchReplay.of(given, events).problem()
 
 
+def without_lags(given: BatchInput, events: Iterable[Event]) -> tuple[BatchInput, Iterable[Event]]:
+    """Return scans with the times of what they show, where the stamps of their sensors are late by a known lag.
+
+    Raises KalmarkError if a lag is not known, or if they have another order then.
+    """
+    mounts = {(name, key): mount for name, robot in given.robots.items() for key, mount in robot.sensors.items()}
+    lags = {key: round(mount.lag_s * 1e9) for key, mount in mounts.items() if mount.lags}
+    for robot, sensor in (key for key in lags if mounts[key].sigma_lag_s):
+        raise unsolvable_problem(f"the lag of '{robot}.{sensor}' is in the map, expected lags that are known")
+    if not lags:
+        return given, events
+    events, at = list(events), dict[tuple[int, str], list[int]]()
+    for event in events:
+        if isinstance(event, Scan | Raw):
+            at.setdefault((event.t_ns, event.robot), []).append(lags.get((event.robot, event.sensor), 0))
+    of_steps = [at[key].pop(0) if at.get(key) else 0 for key in zip(given.t_ns.tolist(), given.robot, strict=True)]
+    t_ns = given.t_ns - np.array(of_steps, dtype=np.int64)
+    if (np.diff(t_ns) < 0).any():
+        raise unsolvable_problem("without their lags the scans have another order, expected the same")
+    earlier = [
+        replace(event, t_ns=event.t_ns - lags[event.robot, event.sensor])
+        if isinstance(event, Scan | Raw) and (event.robot, event.sensor) in lags
+        else event
+        for event in events
+    ]
+    return replace(given, t_ns=t_ns), sort_events(earlier)
+
+
 class BatchReplay:
     """Replays the events and gathers nodes, motions and sightings."""
 
@@ -138,6 +166,7 @@ class BatchReplay:
     @classmethod
     def of(cls, given: BatchInput, events: Iterable[Event]) -> BatchReplay:
         """Return the events replayed.  Raises KalmarkError if they are not those of the associations."""
+        given, events = without_lags(given, events)
         replay = cls(given)
         for event in events:
             replay.take(event)

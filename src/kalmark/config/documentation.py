@@ -95,6 +95,7 @@ def page() -> str:
         _choice("`landmarks`, and `landmark` of a sensor", "landmark"),
         _choice("`association`, also of a sensor", "association"),
         _section("`upkeep`, also of a sensor", section_of("upkeep", "upkeep")),
+        _section(f"{of_sensor}.classes`", section_of("classes", "classes")),
         _choice("`estimator`", "estimator"),
         _section("`map`", schema.MapConfig),
         _section("`picture`", section_of("picture", "picture")),

@@ -44,6 +44,7 @@ Initialization = Annotated[Any, Choice("initialization", default="immediate")]
 Detector = Annotated[Any, Choice("detector")]
 Attention = Annotated[Any, Choice("attention", typed=False)]
 Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
+Classes = Annotated[Any, Choice("classes", typed=False)]
 Picture = Annotated[Any, Choice("picture", typed=False)]
 
 Plugins = Annotated[tuple[str, ...], Field(strict=False)]
@@ -215,6 +216,12 @@ class Mounted(ModelSection):
     """Start landmarks at first sight, or late; late ones are points."""
     robust: Literal["huber", "student"] | None = None
     """Robust weight of outliers: bounded, or nearly zero.  All observations count in full if absent."""
+    lag_s: Number = 0.0
+    """Time by which the stamps of its scans are late."""
+    sigma_lag_s: NotNegative = 0.0
+    """Standard deviation of the lag; above 0 it is in the map and is estimated."""
+    classes: Classes | None = None
+    """Classes that the sensor reports of landmarks, as colours; none if absent."""
     preset: Preset | None = None
     """Take what is not given from a documented sensor of this type: docs/presets.md."""
 

@@ -120,9 +120,10 @@ def _mount_in_map(slam: Slam, name: str, mount: Mount) -> Mount:
     if mount.block(name) is None:
         return mount
     mean, pose, sensor = slam.mean(name), len(mount.at), mount.sensor
-    if isinstance(sensor, Calibrated) and len(mean) > pose:
-        sensor = sensor.with_parameters(mean[pose:])
-    return replace(mount, at=mean[:pose], sensor=sensor, cov=None)
+    own, lag_s = mean[pose + mount.lags :], float(mean[pose]) if mount.lags else 0.0
+    if isinstance(sensor, Calibrated) and len(own):
+        sensor = sensor.with_parameters(own)
+    return replace(mount, at=mean[:pose], sensor=sensor, cov=None, lag_s=lag_s, sigma_lag_s=0.0)
 
 
 def sensors_of(run: Run) -> dict[Where, tuple[str, ...]]:

@@ -261,7 +261,8 @@ def remove_sightings(event: Event, others: set[str], left_out: Counter[str]) -> 
         return None
     ids = tuple(id_ for id_ in event.ids if id_ not in others)
     cov = event.cov[keep] if event.cov is not None and event.cov.ndim == 3 else event.cov
-    return replace(event, y=event.y[keep], ids=ids, cov=cov)
+    classes = None if event.classes is None else tuple(np.array(event.classes)[keep])
+    return replace(event, y=event.y[keep], ids=ids, cov=cov, classes=classes)
 
 
 def clip_time(log: Log, from_s: float | None, to_s: float | None) -> Log:

@@ -13,7 +13,7 @@ LONGEST_LINE = 10_000_000  # characters: more than any scan has
 _TIMES = ("t_s", "t_ns", "robot")
 KEYS: dict[str, tuple[type[Control | Scan | Fix], tuple[str, ...]]] = {
     "control": (Control, (*_TIMES, "u", "cov", "share", "uneven")),
-    "scan": (Scan, (*_TIMES, "sensor", "y", "ids", "cov")),
+    "scan": (Scan, (*_TIMES, "sensor", "y", "ids", "cov", "classes")),
     "fix": (Fix, (*_TIMES, "y", "cov")),
 }
 """By their `type`: the events, and the keys that they have."""

@@ -1,7 +1,8 @@
 """Read kalmark's own log, a folder of CSV files with headers (docs/datasets.md, "Native logs").
 
 `controls.csv`  t_s, robot, the control's columns[, own noise]
-`scans.csv`     t_s, robot, sensor, id, the sensors' columns[, own noise]; a sensor leaves the others' columns empty
+`scans.csv`     t_s, robot, sensor, id[, class], the sensors' columns[, own noise]; a sensor leaves the others' columns
+                empty
 `measurements.csv` t_s, robot, sensor, the sensors' columns[, own noise]: scans of one row without an id
 `fixes.csv`     t_s, robot, x_m, y_m[, z_m], own noise
 `truth.csv`     t_s, robot, x_m, y_m, theta_rad | x_m, y_m, z_m, qx, qy, qz, qw
@@ -141,6 +142,7 @@ class _Rows:
     t_ns: int
     y: list[list[float]] = field(default_factory=list)
     ids: list[Id | None] = field(default_factory=list)
+    classes: list[str | None] = field(default_factory=list)
     covs: list[Array | None] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
     empty: bool = False
@@ -211,7 +213,8 @@ class _Reader:
         robot, sensor = key
         covs = [cov for cov in rows.covs if cov is not None]
         cov = np.array(covs) if covs else None
-        yield Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov)
+        classes = rows.classes if any(rows.classes) else None
+        yield Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov, classes=classes)
 
     def add(self, rows: _Rows, row: Row) -> None:
         """Add one row of `scans.csv` to its scan.  Raises Refused."""
@@ -229,6 +232,7 @@ class _Reader:
             raise Refused("own noise in some rows of this scan only, expected it in all of them or in none")
         rows.y.append(y)
         rows.ids.append(name)
+        rows.classes.append((row.text("class") if "class" in row.table.index else "") or None)
         rows.covs.append(cov)
         rows.lines.append(row.line)
 

@@ -124,9 +124,9 @@ def scans(log: Log) -> Iterator[Row]:
         if not count:
             yield begin
         covs = [None] * count if s.cov is None else np.broadcast_to(s.cov, (count, size, size))
-        for y, id_, cov in zip(s.y, s.ids or [None] * count, covs, strict=True):
+        for y, id_, of, cov in zip(s.y, s.ids or [None] * count, s.classes or [None] * count, covs, strict=True):
             own = numbers(log.sensor_columns, (s.robot, s.sensor), y) | upper_triangle(cov, f"scan at {s.t_s} s")
-            yield begin | ({} if id_ is None else {"id": id_text(id_)}) | own
+            yield begin | ({} if id_ is None else {"id": id_text(id_)}) | ({} if of is None else {"class": of}) | own
 
 
 def frames(log: Log, folder: Path) -> Iterator[Row]:

@@ -126,4 +126,4 @@ def _distances(scan: ScanContext, rows: Sequence[int], names: Sequence[Id], lost
                 d2[i, j] = np.where(others, np.inf, d2[i, j])
             d2[i, j] = np.where(lost[i] & (log_volume_ratio(Z, R) > WELL_KNOWN), np.inf, d2[i, j])
     d2[np.isnan(d2)] = np.inf
-    return d2
+    return d2 + scan.class_distances(names, tentative=True)[0][list(rows)]

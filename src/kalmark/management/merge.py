@@ -21,6 +21,7 @@ from kalmark.filter.layout import P_AT, P_SIZE
 from kalmark.filter.map import Map, StochasticMap
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3, Space
+from kalmark.tracks.classes import distance_of_landmarks
 from kalmark.tracks.scan import Start
 from kalmark.tracks.track import RECENT, Tracks
 
@@ -105,7 +106,8 @@ def proposal(map_: Map, tracks: Tracks, name: Id, robot: int, sensor: Array, odd
     for pairs in _hypotheses(look, name):
         z, Z = look.differences(pairs)
         chance = log_density_about(map_, tracks, [name], sensor)
-        found = log_ratios(z, Z, np.full(len(pairs), chance))
+        of_classes = [distance_of_landmarks(*(tracks.confirmed[n].classes for n in pair)) for pair in pairs]
+        found = log_ratios(z, Z, chance + 0.5 * np.array(of_classes))
         best = int(np.argmax(np.cumsum(found.ratio))) + 1
         d2 = 2.0 * float((found.bound - found.ratio)[:best].sum())
         if d2 <= chi2_gate(GATE, z.shape[1] * best):

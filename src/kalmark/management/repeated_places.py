@@ -360,7 +360,8 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
         other is not found and 2 * len(other.pairs) > k and other.overlaps(found) and _differ(found, other)
         for other in all_
     )
-    if score <= -math.log(FALSE_ALARMS):  # as likely by chance: the ratio exceeds 1 over it as seldom
+    # as likely by chance: the ratio exceeds 1 over it as seldom; one that the covariance excludes is less likely yet
+    if score <= -math.log(FALSE_ALARMS if agrees else SURE):
         return None
     sure = bool(p <= SURE and fits and not rivals)
     if sure:  # then two of a pair that were seen in one scan were so by a wrong association

@@ -8,7 +8,8 @@ What is before `expect` are the links of a chain, one function for each of the t
 `expectation` is the readable form of the first.  The filter's kernels call `linearize`: `linearize_chain`, compiled,
 for the built-in models, a `PythonView` for a user's.  Both are tested to be equal.  What is behind the robot's pose in
 the head is, where the map has it, the mount, with the parameters that the sensor has in the map behind it; of a sensor
-that sees its own velocity, whose mount is known, it is the state or a clone, from which its velocity follows.
+that sees its own velocity, whose mount is known, it is the state or a clone, from which its velocity follows.  Of a
+sensor whose lag is in the map, the lag is behind the mount, which is then where it was that long ago.
 
 Any of the blocks may be a given value, of which no Jacobian is asked for: a mount that is not in the head, and what
 stands behind the numbers that are measured.  Those are the numbers of a landmark known exactly, and for a sensor of
@@ -21,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 import numpy as np
 from numba import types
@@ -31,8 +32,9 @@ from kalmark.arrays import Array, Flags
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.declare import built_in
 from kalmark.geometry import frames3d
-from kalmark.geometry.angles import wrap
+from kalmark.geometry.angles import exponential_v, wrap
 from kalmark.geometry.frames import compose
+from kalmark.geometry.rotations import exp, left_jacobian, matrix
 from kalmark.geometry.spaces import Space
 from kalmark.models import landmark_views, landmarks, sensors
 from kalmark.models.landmark_views import EXPECT, LOOK, VARY, residual
@@ -51,24 +53,25 @@ from kalmark.models.protocols import (
 )
 from kalmark.models.state_view import CHAIN, CHAINS, VELOCITY, call_chain, seen, sees_state, velocity_of
 
-View = tuple[int, int, int, int, int, int, int, int, int, Array, Array, Flags]
+View = tuple[int, int, int, int, int, int, int, int, int, Array, Array, Flags, int, Array]
 # addresses of a linearizer, its `links`, `compose`, the chain of a state (0: none), the landmark's `look` (0: none),
 # the sensor's `expected`, its `varied` (0: its parameters are known), the motion's `velocity` (0: the state has none);
 # then the sensor's code, mount, parameters (of one that sees its velocity: the time since the last scan and the
-# control), angles
-VIEW = "Tuple((i8, i8, i8, i8, i8, i8, i8, i8, i8, f8[::1], f8[::1], b1[::1]))"
+# control), angles; then the mount some time ago (0: without a lag), and the past of the robot
+VIEW = "Tuple((i8, i8, i8, i8, i8, i8, i8, i8, i8, f8[::1], f8[::1], b1[::1], i8, f8[::1]))"
 LINEARIZE = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 SENSOR_AT = signature_of("Tuple((f8[::1], f8[:, ::1]))(i8, f8[::1], i8, f8[::1])")
 COMPOSE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1])")
+MOUNT_AGO = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8, f8[::1])")
 # of view, head, landmarks l and the given block: v (K, d), V_T (K, d, n) of what is between, T_h (n, h), V_l (K, d, n)
 LINKS = signature_of(
     f"Tuple((f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 call_linearize, call_sensor_at = by_address(LINEARIZE), by_address(SENSOR_AT)
-call_compose, call_links = by_address(COMPOSE), by_address(LINKS)
-MOUNT: Final = 9  # where a view has the mount
+call_compose, call_links, call_mount_ago = by_address(COMPOSE), by_address(LINKS), by_address(MOUNT_AGO)
+MOUNT, AGO, PAST = 9, 12, 13  # where a view has the mount, the mount some time ago, and the past of its robot
 
 # of the state r (size,), the control u (m,), parameters and seconds: the new r, R_r (dof, dof), R_u (dof, m)
 MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")
@@ -82,6 +85,52 @@ COMPOSES = {3: compose, 7: frames3d.compose}  # by the size of a pose
 def sensor_pose(r: Array, mount: Array) -> tuple[Array, Array, Array]:
     """Return the sensor's pose T = r o mount with T_r and T_s, in the plane (3,) or in space (7,)."""
     return COMPOSES[len(r)](r, mount)
+
+
+@compiled
+def follow_in_plane(twist: Array, seconds: float) -> tuple[Array, Array]:
+    """Return the pose d (3,) to which a constant twist (3,) leads in some seconds, and d_t (3, 1)."""
+    a, d, d_t = twist[2] * seconds, np.empty(3), np.empty((3, 1))
+    p, q = exponential_v(a)
+    d[0], d[1], d[2] = (p * twist[0] - q * twist[1]) * seconds, (q * twist[0] + p * twist[1]) * seconds, a
+    cos, sin = math.cos(a), math.sin(a)
+    d_t[0, 0], d_t[1, 0], d_t[2, 0] = cos * twist[0] - sin * twist[1], sin * twist[0] + cos * twist[1], twist[2]
+    return d, d_t
+
+
+@compiled
+def follow_in_space(twist: Array, seconds: float) -> tuple[Array, Array]:
+    """Return the pose d (7,) to which a constant twist (6,) leads in some seconds, and d_t (6, 1)."""
+    d, d_t, v, w = np.empty(7), np.empty((6, 1)), twist[:3].copy(), twist[3:].copy()
+    d[3:] = exp(w * seconds)
+    d[:3] = left_jacobian(w * seconds) @ v * seconds
+    d_t[:3, 0], d_t[3:, 0] = matrix(d[3:].copy()) @ v, w
+    return d, d_t
+
+
+@compiled
+def mount_ago_in_plane(s: Array, lag_s: float, past: Array) -> tuple[Array, Array, Array]:
+    """Return where a mount s (3,) was `lag_s` ago: B (3,) in the frame that its robot has now, B_s and B_lag (3, 1).
+
+    `past` (7,) has the lag at which the pose of the robot was exactly the last three, and the twist about it.
+    """
+    d, d_t = follow_in_plane(past[1:4].copy(), past[0] - lag_s)
+    D, _, D_d = compose(past[4:].copy(), d)
+    B, B_D, B_s = compose(D, s)
+    return B, B_s, -(B_D @ D_d @ d_t)
+
+
+@compiled
+def mount_ago_in_space(s: Array, lag_s: float, past: Array) -> tuple[Array, Array, Array]:
+    """Return where a mount s (7,) was `lag_s` ago, of a `past` (14,): B (7,), B_s and B_lag (6, 1)."""
+    d, d_t = follow_in_space(past[1:7].copy(), past[0] - lag_s)
+    D, _, D_d = frames3d.compose(past[7:].copy(), d)
+    B, B_D, B_s = frames3d.compose(D, s)
+    return B, B_s, -(B_D @ D_d @ d_t)
+
+
+FOLLOW = {3: follow_in_plane, 6: follow_in_space}  # by the size of a twist
+MOUNTS_AGO = {3: mount_ago_in_plane, 7: mount_ago_in_space}  # by the size of a pose
 
 
 def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: Array) -> tuple[Array, ...]:
@@ -124,6 +173,7 @@ class PythonView:
     """The chain of a user's sensor, landmark or motion, evaluated in Python; without a landmark it is of the state.
 
     `since` (1 + k,) of a sensor that sees its own velocity: the seconds since its last scan and the control in force.
+    `past` (7 or 14,) is that of the robot (`mount_ago_in_plane`), of a sensor whose lag is in the map; else (0,).
     """
 
     sensor: Any
@@ -132,6 +182,7 @@ class PythonView:
     angular: Flags
     motion: Any = None
     since: Array = field(default_factory=lambda: NOTHING)
+    past: Array = field(default_factory=lambda: NOTHING)
 
     @property
     def moving(self) -> bool:
@@ -142,13 +193,17 @@ class PythonView:
         """Return e (K, m), z (K, p), E_h (K, p, 3 or more) and E_l (K, p, n), as `linearize_chain` does."""
         pose, m, sensor = len(self.mount), len(self.angular), self.sensor
         r, behind, measured, given = head[:pose], head[pose:], y[:, :m], y[:, m:]
-        s, own = self.mount, behind[:0]
+        s, own, s_b = self.mount, behind[:0], None
         if len(behind) and not self.moving:
             s, own = behind[:pose], behind[pose:]
+        if len(self.past):
+            s, B_s, B_lag = MOUNTS_AGO[pose](s, own[0], self.past)
+            own, s_b = own[1:], np.concatenate([B_s, B_lag], axis=1)
         if len(own):
             sensor = sensor.with_parameters(own)
         v, V_r, V_s, V_l = self._view(r, s, behind, l, given)
         e, E_v = sensor.expect(v)
+        V_s = V_s if s_b is None else V_s @ s_b
         parts = [E_v @ V_r, *([E_v @ V_s] if len(behind) else [])]
         if len(own):
             parts.append(sensor.parameters_jacobian(v))
@@ -180,19 +235,22 @@ def is_built_in(sensor: Any, landmark: Any) -> bool:
     return (landmark is None or known) and type(sensor) in sensors.BUILT_IN
 
 
-def view_of(sensor: Any, landmark: Any, mount: Array, motion: Any = None, since: Array = NOTHING) -> Any:
+def view_of(
+    sensor: Any, landmark: Any, mount: Array, motion: Any = None, since: Array = NOTHING, past: Array = NOTHING
+) -> Any:
     """Return the argument of `linearize`, a `View` of compiled models or a `PythonView`; `mount` (3,) or (7,).
 
     Without a landmark it is that of a sensor of the state of a robot with this `motion`.  For a sensor of landmarks
     that sees its own velocity `since` (1 + k,) is read at each scan: the seconds since the last one, which count where
-    the motion has no velocity in its state, and the control in force where that has the turn rate.
+    the motion has no velocity in its state, and the control in force where that has the turn rate.  The `past`
+    (7 or 14,) of its robot is read at each scan of a sensor whose lag is in the map.
     """
     angular = np.array(sensor.angular, dtype=np.bool_)
     links, chains, of_state = links_of(sensor, landmark, motion)
     if not is_built_in(sensor, landmark) or (of_state and type(motion) not in built_in("motion")):
-        return PythonView(sensor, landmark, mount, angular, motion, since)
+        return PythonView(sensor, landmark, mount, angular, motion, since, past)
     known, numbers = parameter_covariance(sensor) is None, sensor.constants if landmark else sensor.parameters
-    plain = known and type(sensor) is sensors.RangeBearing and type(landmark) is landmarks.Point2D
+    plain = known and type(sensor) is sensors.RangeBearing and type(landmark) is landmarks.Point2D and not len(past)
     return (
         address_of(linearize_ranges if plain else linearize_chain, LINEARIZE),
         _address(None if plain else links, LINKS),
@@ -206,6 +264,8 @@ def view_of(sensor: Any, landmark: Any, mount: Array, motion: Any = None, since:
         mount,
         since if landmark and chains else np.array(numbers, dtype=np.float64),
         angular,
+        _address(MOUNTS_AGO[len(mount)] if len(past) else None, MOUNT_AGO),
+        past,
     )
 
 
@@ -325,8 +385,8 @@ def linearize_chain(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
 
     A block that is given behind the measurements, in y, is so in e.  E_h = E_v V_T T_h, and E_l = E_v V_l.
     """
-    _, links_at, _, _, look_at, expect_at, vary_at, velocity_at, code, at, par, angular = view
-    own = head[2 * len(at) if vary_at != 0 else len(head) :]
+    _, links_at, _, _, look_at, expect_at, vary_at, velocity_at, code, at, par, angular, ago_at, _ = view
+    own = head[2 * len(at) + (ago_at != 0) if vary_at != 0 else len(head) :]
     measured, given = split_columns(y, len(angular))
     v, V_T, T_h, V_l = call_links(links_at, (view, head, l, given))
     par = with_first(par, own)
@@ -347,7 +407,13 @@ def links_of_landmarks(view: View, head: Array, l: Array, given: Array) -> Links
     """
     at, known = view[MOUNT], given.shape[1] > 0
     pose, mounted = len(at), len(head) > len(at)
-    T, T_r, T_s = call_compose(view[2], (head[:pose], head[pose : 2 * pose] if mounted else at))
+    s = head[pose : 2 * pose] if mounted else at
+    if view[AGO] == 0:
+        T, T_r, T_s = call_compose(view[2], (head[:pose], s))
+    else:
+        B, B_s, B_lag = call_mount_ago(view[AGO], (s, head[2 * pose], view[PAST]))
+        T, T_r, T_B = call_compose(view[2], (head[:pose], B))
+        T_s = T_B @ append_columns(B_s, B_lag)
     v, V_T, V_l = landmark_views.look(view[4], (T, given if known else l))
     return v, V_T, append_columns(T_r, T_s) if mounted else T_r, np.empty((len(v), V_l.shape[1], 0)) if known else V_l
 

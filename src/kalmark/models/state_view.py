@@ -31,6 +31,7 @@ from kalmark.arrays import Array
 from kalmark.compiled import by_address, compiled, signature_of
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import left_jacobian_inverse, left_jacobian_rate, log, matrix, skew
 from kalmark.models.protocols import (
     CHANGE,
@@ -116,6 +117,12 @@ def mean_twist_in_space(r: Array, s: Array, l: Array, since: Array, velocity: in
     J[:3, :3] = J[3:, 3:] = inverse / since[0]
     J[:3, 3:] = -(inverse @ (left_jacobian_rate(turn, way) @ inverse)) / since[0]
     return t, J @ C_r, J @ C_s, J @ C_l
+
+
+def twist_between(before: Array, after: Array, seconds: float) -> Array:
+    """Return the constant twist (3 or 6,) with which a robot goes from one pose, (3,) or (7,), to another."""
+    run = mean_twist_in_plane if len(before) == 3 else mean_twist_in_space
+    return np.asarray(run(after, ORIGIN[len(after)], before, np.array([seconds]), 0)[0])
 
 
 @compiled

@@ -13,7 +13,7 @@ from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
 from kalmark.logs.log import Log
-from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth, parameter_names, self_calibrating
+from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth, self_calibrating
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import NONE, WHOLE, Biased, CalibratedMount, Camera, Measuring
@@ -96,9 +96,7 @@ def calibrated_mounts(slam: Slam) -> tuple[CalibratedMount, ...]:
     """Return the mounts of the sensors that calibrate themselves, as estimated and as given."""
     named = {".".join(key): mount for key, mount in mounts_of(slam.robots).items()}
     return tuple(
-        CalibratedMount(
-            name, mean, slam.covariance(name), block[2], parameter_names(mount.sensor)[: len(mean) - len(mount.at)]
-        )
+        CalibratedMount(name, mean, slam.covariance(name), block[2], mount.parameter_names[: len(mean) - len(mount.at)])
         for name, mount in named.items()
         if (block := mount.block(name)) is not None and name in slam.tracks.slots and len(mean := slam.mean(name))
     )

@@ -18,7 +18,7 @@ from kalmark.results.filter_description import cameras, mount_now, observed_poin
 from kalmark.results.history import RobotStart
 from kalmark.results.landmark_table import MapLandmarks, shapes
 from kalmark.results.measures import Rigid
-from kalmark.results.scene import Ray, Scene, Way, drawn_box, places_of
+from kalmark.results.scene import Ray, Scene, Way, drawn_box, places_of, places_of_classes
 from kalmark.results.truth import as_rigid, frame_offset, landmarks_of_size, move_landmarks
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ def scene_of_filter(slam: Slam, truth: Any, reports: Iterable[Report], path: Any
         rays=rays,
         picture=picture,
         end="robot",
+        classes=places_of_classes(mapped, {str(i): mean[:d] for i, mean in zip(mapped.ids, mapped.means, strict=True)}),
     )
 
 

@@ -22,6 +22,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -169,7 +170,8 @@ class MapLandmarks:
     The place of a landmark is its position in the plane, its position, endpoints or pose in space, whatever its state
     in the map is (`kalmark.results.landmark_table`); NaN if its model has no position.  `exact` are those
     known exactly beforehand, which the filter had outside its map.  `log_odds` are those that a landmark exists, of the
-    landmarks that were looked at again, and `unseen` those that were not seen again where they should be.
+    landmarks that were looked at again, and `unseen` those that were not seen again where they should be.  `classes`
+    have the likeliest class of those of which one was reported, and how likely it is.
     """
 
     ids: list[Id]
@@ -181,6 +183,7 @@ class MapLandmarks:
     exact: frozenset[Id] = frozenset()
     log_odds: Mapping[Id, float] = field(default_factory=dict)
     unseen: frozenset[Id] = frozenset()
+    classes: Mapping[Id, tuple[str, float]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"<MapLandmarks: {len(self)}, known exactly {len(self.exact)}>"
@@ -211,7 +214,9 @@ class MapLandmarks:
                 means[k], covariances[k] = mean, covariance
         observations = [int(count) for count in table.observations]
         exact = frozenset(name for name in table.ids if slam.is_known(name))
-        of = means, covariances, observations, in_space, exact, table.log_odds, table.unseen
+        likely = {name: slam.classes(name) for name in table.ids}
+        classes = {name: max(of.items(), key=itemgetter(1)) for name, of in likely.items() if of}
+        of = means, covariances, observations, in_space, exact, table.log_odds, table.unseen, classes
         return cls(list(table.ids), list(table.kinds), *of)
 
     def shape(self, slam: Slam, robots: Sequence[str]) -> tuple[MapLandmarks, Array]:
@@ -282,6 +287,7 @@ class MapLandmarks:
     def to_csv(self) -> str:
         """Return the text of ``landmarks.csv``: id, kind, coordinates, triangle of the covariance, observations.
 
+        If classes were reported, `class` is the likeliest one and `class_p` how likely it is.
         If there are any known exactly, `known` is "exactly" in their rows; if any were looked at again, there are the
         `log_odds` that they exist, and `mark` is "not seen again" of those that were not where they should be.
         """
@@ -290,7 +296,8 @@ class MapLandmarks:
         used = dict.fromkeys(name for row in rows for name in row) or dict.fromkeys((*usual, *_cov_names(usual)))
         header = ["id", "kind", *(name for name in used if name in _PLACES)]
         header += [*(name for name in _cov_names(_ERRORS) if name in used), "observations"]
-        header += ["known"] * bool(self.exact) + ["log_odds", "mark"] * bool(self.log_odds)
+        header += ["class", "class_p"] * bool(self.classes) + ["known"] * bool(self.exact)
+        header += ["log_odds", "mark"] * bool(self.log_odds)
         return csv_text(header, ([row.get(name, "") for name in header] for row in rows))
 
     def _cells(self, k: int) -> dict[str, Any]:
@@ -301,6 +308,7 @@ class MapLandmarks:
         cells: dict[str, Any] = {"id": name, "kind": kind, "observations": self.observations[k]}
         cells |= zip(axes, mean.tolist(), strict=False)
         cells |= zip(_cov_names(errors), P[np.triu_indices(len(errors))].tolist(), strict=True)
+        cells |= zip(("class", "class_p"), self.classes.get(name, ()), strict=False)
         cells |= {"known": "exactly"} if name in self.exact else {}
         cells |= {"log_odds": float(self.log_odds[name])} if name in self.log_odds else {}
         return cells | ({"mark": UNSEEN} if name in self.unseen else {})
@@ -312,6 +320,7 @@ class MapLandmarks:
             rows = csv.DictReader(file)
             table, exact = cls([], [], [], [], [], "z_m" in (rows.fieldnames or ())), set[Id]()
             plane, odds, unseen = False, dict[Id, float](), set[Id]()
+            of_class = dict[Id, tuple[str, float]]()
             for number, row in enumerate(rows, start=2):
                 try:
                     names = [name for name in _PLACES if row.get(name)]
@@ -324,13 +333,15 @@ class MapLandmarks:
                     table.means.append(np.array([float(row[name]) for name in names]))
                     table.covariances.append(cov)
                     table.observations.append(int(row["observations"]))
+                    of_class |= {table.ids[-1]: (row["class"], float(row["class_p"]))} if row.get("class") else {}
                     exact |= {table.ids[-1]} if row.get("known") else set()
                     odds |= {table.ids[-1]: float(row["log_odds"])} if row.get("log_odds") else {}
                     unseen |= {table.ids[-1]} if row.get("mark") else set()
                 except (KeyError, TypeError, ValueError) as error:
                     raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
         in_space = table.in_space and not plane
-        return replace(table, in_space=in_space, exact=frozenset(exact), log_odds=odds, unseen=frozenset(unseen))
+        of = {"exact": frozenset(exact), "log_odds": odds, "unseen": frozenset(unseen), "classes": of_class}
+        return replace(table, in_space=in_space, **of)
 
 
 def refuse_other_than_points(slam: Slam, what: str, *, walls: bool = False) -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import is_color_like
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.markers import MarkerStyle
@@ -209,6 +210,7 @@ def strokes(scene: Scene) -> list[Stroke]:
         *_landmark_strokes(scene, crowded),
         *_robot_strokes(scene),
         *(_ray_strokes(scene) if scene.picture.sensors else []),
+        *_class_strokes(scene, crowded),
         Stroke(scene.unseen, cross, "landmarks not seen again", cross | {"markersize": 6}),
         Stroke(scene.repeats, twice, "landmarks mapped twice", twice),
     ]
@@ -272,6 +274,15 @@ def _landmark_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
         Stroke(lines, {"color": colours["lines"], "linewidth": 1.8, "zorder": 5}),
         Stroke(tags, {"color": colours["landmarks"], "linewidth": 1.4, "zorder": 5}),
     ]
+
+
+def _class_strokes(scene: Scene, crowded: bool) -> list[Stroke]:
+    """Return the landmarks of each class, in the colour that its name is, if it is one."""
+    out = []
+    for k, (name, places) in enumerate(scene.classes.items()):
+        dot = _marks("o", name if is_color_like(name) else f"C{k}", 3 if crowded else 5, 6)
+        out.append(Stroke(places, dot, name, dot | {"markersize": 5}))
+    return out
 
 
 def _robot_strokes(scene: Scene) -> list[Stroke]:

@@ -221,6 +221,7 @@ def series(run: Recording, scene: Scene) -> Data:
         "trueLandmarks": {"id": [str(i) for i in true], **xy(np.array([*true.values()]).reshape(-1, scene.d))},
         "knownLandmarks": {"id": [str(i) for i in scene.known_ids], **xy(scene.known)},
         "unseenLandmarks": xy(scene.unseen),
+        "classes": {name: xy(places) for name, places in scene.classes.items()},
         "trueLines": xy(join_polylines(scene.true_lines(), scene.d)),
         "fixes": {robot: xy(thin(way.fixes)) for robot, way in scene.ways.items() if len(way.fixes)},
         "repeats": xy(scene.repeats),

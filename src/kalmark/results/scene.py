@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +26,7 @@ from kalmark.report import Report
 from kalmark.results.control_gaps import while_lost
 from kalmark.results.evaluate import FIX_GAP_S, aligned_fixes
 from kalmark.results.history import Camera, History, Ints, MapSnapshot, Measuring
-from kalmark.results.landmark_table import EUCLIDEAN, EUCLIDEANS, Shapes, shapes
+from kalmark.results.landmark_table import EUCLIDEAN, EUCLIDEANS, MapLandmarks, Shapes, shapes
 from kalmark.results.measures import Rigid, rigid, sigmas
 from kalmark.results.recording import Recording
 from kalmark.results.truth import as_rigid, move_landmarks
@@ -97,13 +97,22 @@ class Way(NamedTuple):
     used: Array
 
 
+def places_of_classes(landmarks: MapLandmarks, at: Mapping[str, Array]) -> dict[str, Array]:
+    """Return where the landmarks of each class are (N, d), by the places (d,) of all that are to be drawn."""
+    out: dict[str, list[Array]] = {}
+    for name, (of, _) in sorted(landmarks.classes.items(), key=lambda each: each[1]):
+        if str(name) in at:
+            out.setdefault(of, []).append(at[str(name)])
+    return {of: np.array(places) for of, places in out.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A run up to one of its steps, or a filter now, in the plane (d = 2) or in space (d = 3).
 
     `ways` are those of the robots.  `ids` and `shapes` are the landmarks of the map, `true_landmarks` true places,
     `known` (N, d) are the landmarks known exactly and `known_ids` their names.
-    `unseen` (N, d) are those that were not seen again where they should be.
+    `unseen` (N, d) are those that were not seen again where they should be, `classes` the places (N, d) of each class.
     `repeats` (3 P, d) lines between landmarks that were mapped twice, NaN between them.  `low` and `high` (d,) are the
     corners of the box to draw, the same for all steps.  Covariances are those of the shape (`kalmark.results.gauge`) or
     those in the `world`.  The truth is `aligned` by a rigid motion of the path where the frames differ, and
@@ -128,6 +137,7 @@ class Scene:
     rays: tuple[Ray, ...] = ()
     picture: Picture = USUAL
     end: str = "end"
+    classes: Mapping[str, Array] = field(default_factory=dict)
 
     @classmethod
     def of(cls, run: Recording, step: int | None = None, world: bool = False) -> Scene:
@@ -164,7 +174,7 @@ class Scene:
         return cls(
             d, {robot: way_of(run, robot, P, to_map, step) for robot in history.robots}, landmarks, ids, now,
             history.cameras, low, high, join_polylines([line[:, :d] for line in twice], d), unseen, known_at,
-            tuple(exact.ids), world, aligned, picture=picture,
+            tuple(exact.ids), world, aligned, picture=picture, classes=places_of_classes(last, at),
         )  # fmt: skip
 
     @property

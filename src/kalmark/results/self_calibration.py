@@ -112,9 +112,9 @@ def _constant_figures(names: Sequence[str], values: Array, P: Array) -> dict[str
     """Return a sensor's constants with their sigmas: scale and bias for a gain and an offset, others as named."""
     found, J = dict(zip(names, values.tolist(), strict=True)), np.eye(len(names))
     if "gain" in found:
-        gain, offset = found.pop("gain"), found.pop("offset", None)
-        J = np.array([[-1.0 / gain, 0.0], [-(offset or 0.0) / gain, 1.0]])[: len(names), : len(names)] / gain
-        found = {"scale": 1.0 / gain} | ({} if offset is None else {"bias_m": offset / gain})
+        gain, offset, i = found.pop("gain"), found.pop("offset", None), names.index("gain")
+        J[i:, i:] = (np.array([[-1.0 / gain, 0.0], [-(offset or 0.0) / gain, 1.0]]) / gain)[: len(J) - i, : len(J) - i]
+        found |= {"scale": 1.0 / gain} | ({} if offset is None else {"bias_m": offset / gain})
     return found | {f"sigma_{name}": own for name, own in zip(found, sigmas(J @ P @ J.T).tolist(), strict=True)}
 
 

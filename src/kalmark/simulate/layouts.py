@@ -1,4 +1,4 @@
-"""Layouts of landmarks of a simulated world: Sola's cloister ([S] App. C), a loop, a random field, a list.
+"""Layouts of landmarks of a simulated world: Sola's cloister ([S] App. C), a loop, a field, a race track, a list.
 
 Layouts of the plane serve robots of space as well: their landmarks are at z = 0.  Those of space are the toolbox's
 thick cloister and house ([TB] `thickCloister`, `house`), a random box, a room of tags.  Plug-ins may
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.random import Generator
 from pydantic import AfterValidator, Field, model_validator
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Index
 from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, unexpected_value
 from kalmark.events import Raw
 from kalmark.geometry.frames3d import from_euler_pose
@@ -48,7 +48,8 @@ Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)
 class Scenery:
     """The landmarks of a world: points (N, 2|3), segments (S, 6) from end to end, tags (T, 7) as poses, in m.
 
-    In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags.
+    In the plane the segments (S, 4) are walls.  `tag_sizes` (T,) are the sides of the tags, `classes` (N,) the classes
+    of the points by number, None where the layout has none.
 
     `raw_of`, of a plug-in's layout, returns of a sensor and its `sensing` what makes its raw data from its pose (7,),
     the time in ns, the names of robot and sensor, and a seed.  What they show is between the `corners` (N, 3).
@@ -59,6 +60,7 @@ class Scenery:
     tags: Array = field(default_factory=lambda: np.empty((0, 7)))
     tag_sizes: Array = field(default_factory=lambda: np.empty(0))
     corners: Array = field(default_factory=lambda: np.empty((0, 3)))
+    classes: Index | None = None
     raw_of: Callable[[Any, Any], Callable[[Array, int, str, str, int], Raw]] | None = None
 
     @property
@@ -174,6 +176,44 @@ class RandomField(OfPoints):
     def place(self, rng: Generator) -> Array:
         """Return random landmarks (count, 2)."""
         return rng.uniform(0.0, self.size_m, (self.count, 2))
+
+
+def along_closed_line(points: Array, spacing_m: float) -> tuple[Array, Array]:
+    """Return places (N, 2) evenly spaced along a smooth closed line through points (K, 2), and its normals (N, 2).
+
+    A normal points to the left.  The spacing is the nearest to the one given that divides the length of the line.
+    """
+    from scipy.interpolate import CubicSpline
+
+    closed = np.vstack([points, points[:1]])
+    chords = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
+    line = CubicSpline(chords, closed, bc_type="periodic")
+    at = np.linspace(0.0, chords[-1], 100 * len(closed))
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(line(at), axis=0), axis=1)))
+    count = max(1, round(float(lengths[-1]) / spacing_m))
+    along = np.interp(np.arange(count) * lengths[-1] / count, lengths, at)
+    ahead = line(along, 1) / np.linalg.norm(line(along, 1), axis=1, keepdims=True)
+    return np.asarray(line(along)), ahead[:, ::-1] * [-1.0, 1.0]
+
+
+class RaceTrack(OfPoints):
+    """Cones on both sides of a closed track: classes 0 to its left, 1 to its right and 2, two pairs, at its start."""
+
+    type: Literal["race_track"] = "race_track"
+    line_m: Points
+    """Places (x, y) on the middle of the track, the start first; a smooth closed line goes through them."""
+    width_m: Positive = 3.5
+    """Distance between the cones of both sides."""
+    spacing_m: Positive = 4.0
+    """Distance between the cones of one side, along the middle."""
+
+    def scenery(self, rng: Generator) -> Scenery:
+        """Return the cones, always the same: those to the left, those to the right, those at the start."""
+        middle, left = along_closed_line(np.array(self.line_m, dtype=np.float64), self.spacing_m)
+        sides = [middle + side * 0.5 * self.width_m * left for side in (1.0, -1.0)]
+        start = [side[0] + step * left[0] @ [[0.0, -1.0], [1.0, 0.0]] for side in sides for step in (-0.3, 0.3)]
+        cones = np.vstack([sides[0][1:], sides[1][1:], start])
+        return Scenery(cones, classes=np.repeat([0, 1, 2], [len(middle) - 1, len(middle) - 1, len(start)]))
 
 
 class ThickCloister(WallLayout):
@@ -372,5 +412,5 @@ class Empty(LayoutSection):
 
 
 Layout = Annotated[Any, OneOf(
-    Cloister, Loop, RandomField, ThickCloister, House, RandomBox, TagRoom, Listed, Empty, group="layouts"
+    Cloister, Loop, RandomField, RaceTrack, ThickCloister, House, RandomBox, TagRoom, Listed, Empty, group="layouts"
 )]  # fmt: skip

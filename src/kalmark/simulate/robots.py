@@ -4,7 +4,7 @@ The guide and the toolbox disturb the *estimator's* control and let the robot mo
 `noise_on: robot` the robot is disturbed and the log holds the command.  Either way the log holds the control
 the estimator is given.  A diffusion always disturbs the robot.  A mount with sigmas truly sits elsewhere: the log's
 rig is the one configured, and where the sensor sits is drawn around it.  So are the constants of a motion with sigmas:
-biases, scales, radii.
+biases, scales, radii; and the lag of a sensor, which is never negative.
 """
 
 from __future__ import annotations
@@ -48,6 +48,7 @@ from kalmark.simulate.routes import Course, Ways, aim, disturb_state, drive_leg,
 from kalmark.simulate.sights import POINTS, Sighted, SimulatedSensing, Things, gaussian, things_in_frame
 from kalmark.simulate.worlds import World
 from kalmark.slam.robot import Mount, Robot
+from kalmark.tracks.classes import Classes
 
 Key = tuple[int, str, str]
 Found = tuple[int, str, Array, list[Id | None] | None, tuple[Id | None, ...]]  # step, sensor, y, ids and origins
@@ -60,7 +61,8 @@ WILD = 30.0  # by so many of its own errors an outlier of a sensor of the state 
 class SimSensor:
     """A sensor, where it truly sits, and what is wrong with it; `laser` is the detector of one whose scans are raw.
 
-    `raw` makes the raw data of one that gives no measurements.
+    `raw` makes the raw data of one that gives no measurements, `classes` are those that it reports, its stamps
+    are `late_s` later than what its scans show.
     """
 
     sensor: Any
@@ -68,6 +70,8 @@ class SimSensor:
     sensing: SimulatedSensing
     laser: Laser | None = None
     raw: Callable[..., Raw] | None = None
+    classes: Classes | None = None
+    late_s: float = 0.0
     frames: Array = field(default_factory=lambda: np.zeros((0, 3)))  # its true poses (steps + 1, 3 or 7)
     walked: int = 0  # the step up to which its constants have walked
     last: tuple[int, Array] | None = None  # step and robot's pose of the last reading or scan
@@ -121,8 +125,8 @@ class Chance:
     """The sources of chance, each a random stream of its own, all from one seed."""
 
     def __init__(self, seed: int | SeedSequence | Generator) -> None:
-        streams = np.random.default_rng(seed).spawn(6)
-        self.layout, self.route, self.control, self.sight, self.faults, self.mounts = streams
+        streams = np.random.default_rng(seed).spawn(7)
+        self.layout, self.route, self.control, self.sight, self.faults, self.mounts, self.classes = streams
 
 
 def simulate(world: World, seed: int | SeedSequence | Generator = 0) -> Log:
@@ -154,8 +158,10 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
     for steps in spans(world, robots, things):
         for robot in robots:
             for k, name, y, ids, real in sensor_scans(robot, robots, things, world, steps, chance):
-                events.append(Scan(t_ns=times[k], robot=robot.name, sensor=name, y=y, ids=ids))
-                origins[times[k], robot.name, name] = real
+                t_ns = times[k] + round(robot.sensors[name].late_s * 1e9)
+                classes = reported_classes(robot.sensors[name], things[POINTS], real, chance)
+                events.append(Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y, ids=ids, classes=classes))
+                origins[t_ns, robot.name, name] = real
             for name, carried in robot.sensors.items():
                 if carried.raw is not None:
                     at_k = steps[carried.sensing.scans_at(steps)].tolist()
@@ -185,7 +191,24 @@ def things_in(world: World, scenery: Scenery, rng: Generator) -> dict[str, Thing
         points = things[POINTS]
         signatures = rng.uniform(0.0, world.signature_max, len(points.values))
         points.values = np.column_stack([points.values, signatures])
+    points, count = things[POINTS], max(map(len, world.class_names()), default=0)
+    drawn = rng.integers(count, size=len(points.values)) if count and scenery.classes is None else scenery.classes
+    points.classes = drawn
     return things
+
+
+def reported_classes(
+    carried: SimSensor, points: Things, real: Sequence[Id | None], chance: Chance
+) -> list[str | None] | None:
+    """Return the classes that a sensor reports of what is `real` (K,), some of them wrong; None if it reports none."""
+    if carried.classes is None or points.classes is None:
+        return None
+    out, names, M = list[str | None](), carried.classes.names, carried.classes.confusion_matrix
+    for name in real:
+        at = name - points.first if isinstance(name, int) else -1
+        of = int(points.classes[at]) if 0 <= at < len(points.classes) else len(names)
+        out.append(names[int(chance.classes.choice(len(names), p=M[of]))] if of < len(names) else None)
+    return out
 
 
 def true_landmarks(things: dict[str, Things]) -> dict[Id, Array]:
@@ -209,7 +232,8 @@ def sim_robot(world: World, robot: Robot, area: Array, chance: Chance, scenery: 
         laser = mount.detector if isinstance(mount.detector, Laser) else None
         true, at = draw_mount(mount, chance.mounts)
         raw = scenery.raw_of(true, sensing) if scenery.raw_of is not None and sensing.images else None
-        sensors[key] = SimSensor(true, at, sensing, laser, raw)
+        lag_s = mount.lag_s + (chance.mounts.normal(0.0, mount.sigma_lag_s) if mount.sigma_lag_s else 0.0)
+        sensors[key] = SimSensor(true, at, sensing, laser, raw, mount.classes, max(lag_s + sensing.late_s, 0.0))
     course = simulated.route.course(world.steps, world.dt_s, area, chance.route)
     model = self_calibrating(motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)

@@ -35,7 +35,7 @@ from kalmark.models.motion import (
 )
 from kalmark.models.observe import MOVE, NOTHING, call_move
 from kalmark.models.protocols import HasVelocity, diffusion_of
-from kalmark.simulate.layouts import Points
+from kalmark.simulate.layouts import Points, along_closed_line
 from kalmark.simulate.sights import correlated
 
 SLOW_S = 1.0  # in which a robot steered by impulses turns to its target
@@ -103,10 +103,13 @@ class Waypoints(Drive):
     type: Literal["waypoints"] = "waypoints"
     points_m: Points
     """The places (x, y), in space (x, y, z) too."""
+    smooth_m: Positive | None = None
+    """Drive along a smooth closed line through the places (x, y), from place to place at this distance."""
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
         """Yield the places (D,) to drive to, without end, within `area` (2, D)."""
-        yield from cycle(np.array(self.points_m, dtype=np.float64))
+        points = np.array(self.points_m, dtype=np.float64)
+        yield from cycle(points if self.smooth_m is None else along_closed_line(points, self.smooth_m)[0])
 
 
 class Wander(Drive):

@@ -94,6 +94,8 @@ class SimulatedSensing(Section):
     """Pairs of ids that are taken for each other."""
     hidden: Annotated[tuple[int, ...], Field(strict=False)] = ()
     """Ids that are never reported."""
+    late_s: NotNegative = 0.0
+    """By so much the stamps of its scans are later than the lag of the sensor makes them."""
     faults_from_step: Annotated[int, Field(ge=1)] = 1
     """All is well before this step."""
 
@@ -119,7 +121,10 @@ class SimulatedSensing(Section):
 
 @dataclass
 class Things:
-    """All there is to see of one sort: ids from `first` on, `values` (M, n), and which of it was ever seen."""
+    """All there is to see of one sort: ids from `first` on, `values` (M, n), and which of it was ever seen.
+
+    `classes` (M,) are the numbers of the classes of points, None where no sensor reports classes.
+    """
 
     sort: str
     first: int
@@ -127,6 +132,7 @@ class Things:
     sizes: Array
     seen: Flags = field(init=False)
     dimensions: int = 2
+    classes: Index | None = None
 
     def __post_init__(self) -> None:
         self.seen = np.zeros(len(self.values), dtype=np.bool_)

@@ -145,6 +145,11 @@ class World(OfFile):
         sensors = [sensor for robot in self.robots.values() for sensor in robot.sensors.values()]
         return any("signature" in model_of(sensor).columns for sensor in sensors)
 
+    def class_names(self) -> list[tuple[str, ...]]:
+        """Return the classes that each sensor reports, () of one that reports none."""
+        sensors = [sensor for robot in self.robots.values() for sensor in robot.sensors.values()]
+        return [() if sensor.classes is None else tuple(sensor.classes.names) for sensor in sensors]
+
     def times(self) -> tuple[int, ...]:
         """Return the times (ns) at which its steps end."""
         return tuple(round(k * self.dt_s * 1e9) for k in range(1, self.steps + 1))

@@ -48,6 +48,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     report.e, report.z, report.Z, _, fused, _ = done
     for track, used in zip(seen, fused.tolist(), strict=True):
         track.observations += used
+    scan.add_reports(ids, range(len(ids)), fused.tolist())
     if policy.contests and np.count_nonzero(fused) < len(fused):
         group = JudgedScan(range(len(ids)), ids, ids, done, channel.gate)
         tentative.contest(state, scan, model, group, elsewhere.misfits(state, scan, done), policy.upkeep.odds)

@@ -13,6 +13,7 @@ from kalmark.events import MOST, Control, Fix, Scan, finite, is_number, label_of
 from kalmark.filter import kernels
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, Motion, OwnNoise, Sensor, coasts, innovation_size
+from kalmark.tracks.classes import Classes
 
 MOST_OBSERVATIONS = 5000  # of one scan: a map of as many takes 2 GB, and a scan of all of them half a minute
 ROUNDING = 1e-3  # of a correlation
@@ -150,6 +151,14 @@ def refuse_bad_fix(event: Fix, size: int) -> None:
         expected = "x and y in m" if size == 2 else "x, y and z in m"
         raise EventError(f"{label_of_event(event)}: y has shape {event.y.shape}, expected ({size},): {expected}")
     check_covariance(event.cov, size, f"{label_of_event(event)}: cov", definite=True)
+
+
+def refuse_other_classes(event: Scan, classes: Classes) -> None:
+    """Refuse classes that a sensor does not report."""
+    other = {*(event.classes or ())} - {*classes.names, None}
+    if other:
+        wanted = " or ".join([", ".join(classes.names[:-1]), classes.names[-1]])
+        raise EventError(f"{label_of_event(event)}: class is {short_text(min(map(str, other)))}, expected {wanted}")
 
 
 def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | None = None) -> Array:

@@ -65,6 +65,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
             )
             tentative.contest(state, scan, model, judged[-1], misfits, policy.upkeep.odds)
         state.tracks.count(names, done.fused.tolist())
+        scan.add_reports(names, rows, done.fused.tolist())
     return judged, found + _average(state, scan, decisions) if policy.averages else found
 
 

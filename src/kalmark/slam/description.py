@@ -39,7 +39,7 @@ SIGMAS = {
 }
 """The keys of the sigmas of a pose and their axes."""
 EXACT = ("quaternion", "state", "cov")
-UNTYPED = ("attention", "upkeep")  # roles of one model: their sections have no `type`
+UNTYPED = ("attention", "upkeep", "classes")  # roles of one model: their sections have no `type`
 OF_PLACE = ("name", "motion", "start", "sensors", "sensor", "at", "cov")  # fields that are more than one key
 _AXIS = re.compile(r"(?:_|(?<=[vwa]))[xyz](?=_)")  # of a key: vx_mps, gravity_x_mps2
 

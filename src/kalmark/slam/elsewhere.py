@@ -294,6 +294,7 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: Alternative, fi
     F, Q = np.eye(len(rows)), np.zeros((len(rows), len(rows)))
     F[own], Q[own, own] = 0.0, cov
     F[:dof, len(cov) :] = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] for name in mapped)])
+    of.weigh(_mapped_again(state, scan, of, before, after, cov))
     state.map.predict(rows, F, Q)
     state.map.set_predicted(slot, after)
     for name in [name for name in of.young if name in tracks.confirmed]:
@@ -314,6 +315,40 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: Alternative, fi
         )
         moved = math.dist(after[:d], before[:d])
         scan.report.gaps += (Gap(robot, ELSEWHERE, of.since_ns, scan.event.t_ns, moved, turned),)
+
+
+def _mapped_again(
+    state: State, scan: ScanContext, of: Evidence, before: Array, after: Array, cov: Array
+) -> dict[Id, float]:  # fmt: skip
+    """Return the log probabilities that landmarks are at older ones by chance, of those that are there.
+
+    They are moved with their robot from where it was `before` to where it is `after`, with the covariance `cov`.
+    """
+    from scipy.spatial import cKDTree
+
+    tracks, d, pose = state.tracks, scan.dimensions, len(scan.channel.at)
+    frame, dof, kind = FRAMES[pose], scan.channel.pose_dof, scan.channel.landmark.kind
+    names = [n for n, track in tracks.confirmed.items() if n in of.seen and track.model.kind == kind]
+    if kind not in EUCLIDEAN or len(names) < SEVERAL:
+        return {}
+    places, begun = state.map.means(tracks.slots_of(names), d), np.array([of.seen[n][0] for n in names])
+    tree = cKDTree(places)
+    spacing, out = np.median(tree.query(places, 2)[0][:, 1]), dict[Id, float]()
+    for name, place, t_ns in zip(names, places, begun, strict=True):
+        v, V_r, V_l = (part[0] for part in frame.to_frame(before[:pose], place[None]))
+        p, P_r, P_v = (part[0] for part in frame.from_frame(after[:pose], v[None]))
+        nearest = tree.query(p)[1]
+        if not tracks.is_invented(name) or begun[nearest] >= t_ns:
+            continue
+        G = P_v @ np.hstack([V_r, V_l])
+        P = state.map.covariance([scan.robot, tracks.slots[name]])
+        rows = [*range(dof), *range(len(P) - d, len(P))]
+        C = G @ P[np.ix_(rows, rows)] @ G.T + P_r @ cov[:dof, :dof] @ P_r.T
+        volume = 4.0 * gate(SURVEYED, d) ** (d / 2) * math.sqrt(max(np.linalg.det(C), 0.0))
+        z, chance = p - places[nearest], volume / spacing**d
+        if z @ np.linalg.solve(C, z) <= gate(SURVEYED, d) and chance < 1.0:
+            out[name] = max(math.log(max(chance, math.exp(-SURE))), -SURE)
+    return out
 
 
 def _block(state: State, name: Id) -> tuple[Space, Array]:

@@ -88,6 +88,15 @@ class Estimate:
         out[np.ix_(rows, rows)] = P
         return out
 
+    def classes(self, name: Id) -> dict[str, float]:
+        """Return how likely a landmark is of each class, by what was reported of it; {} of one without a report."""
+        track = self.tracks.confirmed.get(name)
+        if track is None or not track.classes:
+            return {}
+        log_p = np.array([*track.classes.values()])
+        p = np.exp(log_p - log_p.max())
+        return dict(zip(track.classes, (p / p.sum()).tolist(), strict=True))
+
     def landmarks(self, *, exactly_known: bool = True) -> LandmarkTable:
         """Return ids, kinds, means, covariances and numbers of observations of all landmarks.
 

@@ -8,11 +8,12 @@ It is that of what is observed from here against what a robot anywhere would obs
 
 and the ratio of an onset s is the sum of these over the landmarks that were begun before s and seen, or first missed,
 after it: those begun since then fit wherever the robot is.  The evidence is the least ratio of any onset (Page 1954).
+Once it is known where the robot is instead, those begun since s that are older landmarks from there add log p each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -63,18 +64,23 @@ class Evidence:
         for name in [*self.missed][:-MOST]:
             del self.missed[name]
 
-    def weigh(self) -> None:
-        """Find the onset of the least ratio."""
+    def weigh(self, again: Mapping[Id, float] | None = None) -> None:
+        """Find the onset of the least ratio.
+
+        The landmarks mapped `again`, with their logs, are older ones if the robot was elsewhere when they were begun.
+        """
         if not self.missed:
             self.ratio = 0.0
             return
         last, first, logs = (np.array(column) for column in zip(*self.missed.values(), strict=True))
-        s = np.unique(np.concatenate([last, first - 1]))
+        twice = np.array([(self.seen[name][0], log) for name, log in (again or {}).items()]).reshape(-1, 2)
+        s = np.unique(np.concatenate([last, first - 1, twice[:, 0].astype(np.int64) - 1]))
         ratios = logs @ ((last[:, None] <= s) & (s < first[:, None]))
         if self.seen:
             recent = islice(reversed(self.seen.values()), RECENT)
             begun, seen, gains = (np.array(column) for column in zip(*recent, strict=True))
             ratios = ratios + gains @ ((begun[:, None] <= s) & (s < seen[:, None]))
+        ratios = ratios + twice[:, 1] @ (s < twice[:, :1])
         self.ratio, self.since_ns = float(ratios.min()), int(s[np.flatnonzero(ratios == ratios.min())[-1]])
 
     @property

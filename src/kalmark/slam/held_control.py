@@ -37,6 +37,7 @@ from kalmark.models.protocols import (
 )
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
+from kalmark.slam.past_motion import PastMotion
 from kalmark.slam.replacing import RejectedFix
 
 NO_NOISE = np.zeros((0, 0))
@@ -254,7 +255,7 @@ class Moving:
 
     `bias` and `error` are the slots of the constants of its controls and of the error that parts of a control share,
     None where there is none.
-    `left_out` are the last fixes, if they were outside the gate.
+    `left_out` are the last fixes, if they were outside the gate.  `past` are its last motions, where a sensor lags.
     """
 
     motion: Motion
@@ -263,7 +264,8 @@ class Moving:
     held: HeldInput
     error: int | None = None
     left_out: list[RejectedFix] = field(default_factory=list)
-    SAVED: ClassVar = ("slot", "bias", "held", "error", "left_out")
+    past: PastMotion | None = None
+    SAVED: ClassVar = ("slot", "bias", "held", "error", "left_out", "past")
 
     @cached_property
     def moves_itself(self) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from kalmark.errors import EventError, MapError
 from kalmark.events import seconds_text
 from kalmark.geometry.spaces import Rn
+from kalmark.models.state_view import twist_between
 from kalmark.report import Gap
 from kalmark.slam.held_control import MotionPart
 from kalmark.slam.state import State
@@ -57,8 +58,11 @@ def move(state: State, name: str, part: MotionPart) -> None:
     if moving.error is None and part.shares and moving.leads_somewhere(state.map, [part]):
         with suppress(MapError):  # it is full: each part has an error of its own
             moving.error = state.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
+    before = state.pose(name) if moving.past is not None else None
     if not state.estimator.predict(state.map, moving.movement(state.map, part)):
         raise _nowhere(state, name, part)
+    if moving.past is not None and before is not None and part.dt_s > 0.0:
+        moving.past.add(part.dt_s, twist_between(before, state.pose(name), part.dt_s))
     for key, given in state.given.items():
         if key[0] == name:
             given.add_motion(part)

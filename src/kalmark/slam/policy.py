@@ -80,7 +80,7 @@ def policy_of(
     kinds = [kind.ray if isinstance(kind, AsPoint) else kind for kind in seen]
     reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
     varies = channel.noise_at is not None or channel.robust is not None
-    looks_back = channel.counts or channel.sees_velocity
+    looks_back = channel.sees_velocity or channel.lags
     approaches, deferred = channel.far is not None or channel.depths, _deferred(mount, channel.landmark)
     return Policy(
         association, upkeep, mount.attention, mount.detector, deferred, delayed,
@@ -148,7 +148,9 @@ def channel_of(
     def threshold(dof: int) -> float:
         return association.threshold(dof, estimator.default_gate)
 
-    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, robot.motion, mount.robust)
+    return Channel(mount.sensor, mount.at, slot, landmark, threshold, others, robot.motion, mount.robust, mount.lags,
+        mount.classes,
+    )  # fmt: skip
 
 
 def refuse_other_world(robots: Mapping[str, Robot], what: str, world: str) -> None:

@@ -13,7 +13,7 @@ from kalmark.arrays import Array
 from kalmark.association.protocol import Association
 from kalmark.declare import parameters
 from kalmark.errors import ModelError
-from kalmark.events import MOST, ROUNDED, Scan, finite, is_writable, short_text, unit_quaternion
+from kalmark.events import MOST, ROUNDED, Scan, finite, is_number, is_writable, short_text, unit_quaternion
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
@@ -24,8 +24,10 @@ from kalmark.models.protocols import (
     Landmark,
     Motion,
     OfState,
+    SeesVelocity,
     Sensor,
     parameter_covariance,
+    parameter_names,
     refuse_misspelt_names,
     refuse_other_views,
 )
@@ -33,8 +35,10 @@ from kalmark.slam.checks import check_covariance, instance, refuse_odd_associati
 from kalmark.slam.gaps import ACTIONS, Gaps
 from kalmark.slam.sources import SearchingDetector
 from kalmark.tracks.channel import ROBUST
+from kalmark.tracks.classes import Classes
 
 INFINITE = math.inf
+MOST_LAG_S = 2.0  # what is later has another clock
 IDENTITY = {3: (0.0, 0.0, 0.0), 7: (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
 WANTED = {
     3: "three finite numbers: x and y in m, heading in rad",
@@ -66,8 +70,10 @@ class Mount:
     turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
     and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
     by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
-    called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas.  `robust`
-    makes outliers count less, "huber" or "student" (docs/association.md; None: all count in full).
+    called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas, and `lag_s`,
+    the time by which the stamps of its scans are late, if that has (docs/time.md).  `robust` makes outliers count less,
+    "huber" or "student" (docs/association.md; None: all count in full).  `classes` are those that the sensor reports of
+    landmarks.
 
     >>> km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1), at=(0.3, 0.0, 0.0)).at
     array([0.3, 0. , 0. ])
@@ -83,6 +89,9 @@ class Mount:
     upkeep: Upkeep | None = None
     initialization: Delayed | Trilateration | Hypotheses | None = None
     robust: str | None = None
+    lag_s: float = 0.0
+    sigma_lag_s: float = 0.0
+    classes: Classes | None = None
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
@@ -108,13 +117,38 @@ class Mount:
             ways = "a Delayed, a Trilateration or Hypotheses"
             one_of: Any = (Delayed, Trilateration, Hypotheses)
             instance(self.initialization, one_of, "Mount: initialization", ways)
+        if self.classes is not None:
+            instance(self.classes, Classes, "Mount: classes", "a Classes")
         if self.robust is not None:
             what = f"Mount: robust is {short_text(self.robust)}"
             if self.robust not in ROBUST:
                 raise ModelError(f"{what}, expected {' or '.join(ROBUST)}, or None")
             if isinstance(self.sensor, OfState):
                 raise ModelError(f"{what}, but a {type(self.sensor).__name__} measures its robot, expected None")
+        self._refuse_odd_lag()
         object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
+
+    def _refuse_odd_lag(self) -> None:
+        for key, least in (("lag_s", -MOST_LAG_S), ("sigma_lag_s", 0.0)):
+            if not (is_number(vars(self)[key]) and least <= vars(self)[key] <= MOST_LAG_S):
+                raise ModelError(
+                    f"Mount: {key} is {short_text(vars(self)[key])}, expected seconds, at most {MOST_LAG_S:g}"
+                )
+        if self.lags and isinstance(self.sensor, OfState | SeesVelocity):
+            name = type(self.sensor).__name__
+            raise ModelError(
+                f"Mount: lag_s is {self.lag_s:g}, but a {name} measures its robot, expected 0 and no sigma"
+            )
+
+    @property
+    def lags(self) -> bool:
+        """True if its lag is in the map."""
+        return self.lag_s != 0.0 or self.sigma_lag_s > 0.0
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The names of what is in the map behind the mount: the lag, and the sensor's own parameters."""
+        return (*["lag_s"][: self.lags], *parameter_names(self.sensor))
 
     def covariance(self, dof: int, what: str) -> Array | None:
         """Return the covariance (dof, dof) of the mount in a robot's frame, or None if it is known exactly."""
@@ -123,16 +157,21 @@ class Mount:
     def block(self, what: str) -> tuple[Space, Array, Array] | None:
         """Return the space, the mean (size,) and the covariance (dof, dof) of this sensor's block, None if it has none.
 
-        That is the mount, if it is uncertain, with the sensor's own parameters behind it, if they are.
+        That is the mount, if it is uncertain, with its lag and the sensor's own parameters behind it, if they are.
         """
         from scipy.linalg import block_diag
 
         pose, dof = len(self.at), 3 if len(self.at) == 3 else 6
         cov, own = self.covariance(dof, what), parameter_covariance(self.sensor)
-        if own is None:
-            return None if cov is None else (mount_space(pose), self.at, cov)
-        whole = block_diag(np.zeros((dof, dof)) if cov is None else cov, own)
-        return mount_space(pose, len(own)), np.concatenate([self.at, self.sensor.parameters]), whole  # type: ignore[attr-defined]
+        if cov is None and own is None and not self.lags:
+            return None
+        means, covs = [self.at], [np.zeros((dof, dof)) if cov is None else cov]
+        if self.lags:
+            means, covs = [*means, [self.lag_s]], [*covs, [[self.sigma_lag_s**2]]]
+        if own is not None:
+            means, covs = [*means, self.sensor.parameters], [*covs, own]  # type: ignore[attr-defined]
+        mean = np.concatenate(means)
+        return mount_space(pose, len(mean) - pose), mean, block_diag(*covs)
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,7 +50,14 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.protocols import Landmark
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import by_ids, locating, maintenance, moves, starting, state_corrections, tentative
-from kalmark.slam.checks import check_covariance, instance, measurements, refuse_bad_control, refuse_odd_parts
+from kalmark.slam.checks import (
+    check_covariance,
+    instance,
+    measurements,
+    refuse_bad_control,
+    refuse_odd_parts,
+    refuse_other_classes,
+)
 from kalmark.slam.checks import check_numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
@@ -268,6 +275,8 @@ class Slam(Estimate):
         state = self.state
         key = event.robot, event.sensor
         channel, policy = state.channels[key], state.policies[key]
+        if event.classes is not None and channel.classes is not None:
+            refuse_other_classes(event, channel.classes)
         if (
             policy.by_ids
             and self.before_scan is None
@@ -291,7 +300,7 @@ class Slam(Estimate):
         )  # fmt: skip
         if len(event.y) and state.repeats(key, event.t_ns, event.y, event.ids):
             return record_repeated_reading(report, ids, channel.dof)
-        why = state.look_back(key) if channel.sees_velocity else ""
+        why = state.look_back(key) if channel.sees_velocity or channel.lags else ""
         if self.before_scan is not None and not why:
             self.before_scan(event.robot, event.sensor)
         if why:

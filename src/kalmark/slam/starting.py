@@ -57,10 +57,13 @@ def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name:
         return Observation(k, id_, "ignored", None, None, str(full))
     if channel.joins:
         track.extent = wall_growth.first_extent(scan, track, k)
-    if not tentative:
+    if tentative:
+        track.status, state.tracks.tentative[name] = Status.TENTATIVE, track
+    else:
         state.tracks.confirm(track)
+    scan.add_reports([name], [k], [True])
+    if not tentative:
         return Observation(k, id_, "new", name, None, reason)
-    track.status, state.tracks.tentative[name] = Status.TENTATIVE, track
     if policy.upkeep.keep_poses:
         track.first = scan.event.t_ns, *scan.key, k
     if held:

@@ -23,6 +23,7 @@ from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import SELDOM, LastMeasurement
+from kalmark.slam.past_motion import PastMotion
 from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, policy_of, refuse_other_world
 from kalmark.slam.reader import LEAST_S, StateReader
 from kalmark.slam.rests import rest_detector
@@ -142,10 +143,16 @@ class State:
                 self.robots, robot, mount, mount_slot, landmark, kinds, association, self.estimator
             )  # fmt: skip
             self.channels[robot.name, name] = channel
+            if channel.lags:
+                self.moving[robot.name].past = self.moving[robot.name].past or PastMotion(channel.pose_dof)
             if isinstance(mount.detector, SearchingDetector):
                 self.sources[robot.name, name] = mount.detector.source(mount.sensor)
             upkeep = mount.upkeep or settings.upkeep
             self.policies[robot.name, name] = policy_of(mount, channel, association, upkeep, settings.reparametrize)
+
+    def pose(self, name: str) -> Array:
+        """Return the pose (3,) or (7,) of a robot."""
+        return self.map.mean(self.moving[name].slot)[: 3 if self.robots[name].motion.space.axes == 1 else 7]
 
     def view(self, key: ChannelKey) -> FilterView:
         """Return what the source of a channel reads."""
@@ -199,8 +206,16 @@ class State:
         return number
 
     def look_back(self, key: ChannelKey) -> str:
-        """Let a channel have its velocity, from its last scan if it counts from there; return what it lacks, or ""."""
+        """Let a channel have its velocity, from its last scan if it counts from there; return what it lacks, or "".
+
+        One that lags has where its robot was when its sensor saw what it shows now.
+        """
         channel, held = self.channels[key], self.clones.of(key)
+        if channel.lags and (past := self.moving[key[0]].past) is not None:
+            if not len(past.seconds):
+                return "its lag is in the map, and no motion of its robot is known yet"
+            channel.past[:] = past.look_back(key[1], float(self.map.mean(channel.mount)[len(channel.at)]))
+            return ""
         if not channel.counts:
             channel.since[1:] = self.moving[key[0]].held.in_force[: len(channel.since) - 1]
             return ""

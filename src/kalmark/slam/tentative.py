@@ -51,6 +51,8 @@ def confirm_tentative(state: State, scan: ScanContext, policy: Policy, new: list
     for match in matches:
         track, u = state.tracks.tentative[match.name], policy.upkeep
         track.hits, track.chances, track.unseen = track.hits + 1, track.chances + 1, -1
+        if not u.confirms(track.hits):
+            scan.add_reports([match.name], [match.k], [True])
         if scan.channel.joins:
             track.extent = wall_growth.extend_extents(scan, [track], [match.k])[0]
         if u.confirms(track.hits):

@@ -20,10 +20,11 @@ from kalmark.geometry.gaussian import gate
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
 from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
-from kalmark.models.observe import is_built_in, landmark_at, linearize, sensor_pose, view_of
+from kalmark.models.observe import MOUNTS_AGO, is_built_in, landmark_at, linearize, sensor_pose, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
 from kalmark.models.state_view import velocity_of
+from kalmark.tracks.classes import Classes
 
 Parts = tuple[tuple[int, int], ...]  # slots of blocks, and how many rows of each from the first on
 
@@ -49,6 +50,7 @@ class ObservationModel:
     at: Array
     motion: Any = None
     since: Array = field(default_factory=lambda: np.zeros(1))
+    past: Array = field(default_factory=lambda: np.zeros(0))
 
     known: bool = False
     """Whether the landmarks are known exactly: y (K, m + n) ends with their numbers, and the slots are the robot's."""
@@ -56,7 +58,7 @@ class ObservationModel:
     @cached_property
     def model(self) -> Any:
         """The view for `linearize`.  Made when it is first needed: models that are built in are compiled then."""
-        return view_of(self.sensor, self.landmark, self.at, self.motion, self.since)
+        return view_of(self.sensor, self.landmark, self.at, self.motion, self.since, self.past)
 
     @cached_property
     def exactly(self) -> ObservationModel:
@@ -107,11 +109,14 @@ class Channel:
     `motion` is that of its robot: a sensor that measures its velocity has it from the state; else it `counts`, from a
     clone of the robot's pose at its last scan.  `since` (1 + k,): the seconds since then, and the control in force
     where that has the turn rate.  `robust`: how outliers count less, one of `ROBUST` (None: all count in full).
+    Of a sensor that `lags`, whose lag is in the map, `past` (7 or 14,) is that of its robot (`mount_ago_in_plane`).
+    `classes` are those that the sensor reports of landmarks, None where it reports none.
     """
 
     def __init__(
         self, sensor: Sensor, at: Array, mount: int, landmark: Landmark, threshold: Callable[[int], float],
         others: Sequence[Landmark], motion: Any = None, robust: str | None = None,
+        lags: bool = False, classes: Classes | None = None,
     ) -> None:  # fmt: skip
         self.sensor: Any = sensor
         self.motion, self.sees_velocity = motion, isinstance(sensor, protocols.SeesVelocity)
@@ -121,6 +126,7 @@ class Channel:
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array
         self.mount, self.landmark = mount, landmark
         self.pose_dof, self.dimensions = (3, 2) if len(self.at) == 3 else (6, 3)
+        self.lags, self.past = lags, np.zeros(1 + self.pose_dof + len(self.at) if lags else 0)
         self.models = self._models(others)
         self.kinds = frozenset(self.models)
         joining = (isinstance(model.landmark, protocols.Joining) for model in self.models.values())
@@ -128,7 +134,7 @@ class Channel:
         self._refuse_misfit()
         self.dof = self._dof()
         self.gate = threshold(self.dof)
-        self.robust = robust
+        self.robust, self.classes = robust, classes
         self.rho: dict[Id, float] = {}  # inverse distances at which landmarks of these ids start, in place of the prior
         full, self.finds_depth = isinstance(sensor, protocols.FullSensor), finds_depth(sensor)
         any_depth = self.finds_depth or isinstance(landmark, protocols.UnknownDepth) or landmark.kind not in EUCLIDEAN
@@ -162,7 +168,7 @@ class Channel:
             types += [AsPoint(ray) for ray in others if self._has_point(ray) and ray.kind not in seen]
         models: dict[str, ObservationModel] = {}
         for landmark in (*types, self.landmark):
-            model = ObservationModel(landmark, self.sensor, self.at, self.motion, self.since)
+            model = ObservationModel(landmark, self.sensor, self.at, self.motion, self.since, self.past)
             models = dict.fromkeys(ALIKE.get(landmark.kind, ()), model) | models | {landmark.kind: model}
         if self.sees_velocity:
             models.pop(ROBOT, None)  # which does not stand still
@@ -227,10 +233,15 @@ class Channel:
         return (pose,) if self.mount < 0 else (pose, (self.mount, len(map_.rows(self.mount))))
 
     def split(self, observer: Array) -> tuple[Array, Array, Array]:
-        """Return pose, mount, both (3,) or (7,), and the sensor's own parameters (k,) of an observer block."""
+        """Return pose, mount, both (3,) or (7,), and the sensor's own parameters (k,) of an observer block.
+
+        The mount of a sensor that lags is where it was when it saw what it shows now.
+        """
         size = len(self.at)
         mount = observer[size : 2 * size] if len(observer) > size else self.at
-        return observer[:size], mount, observer[2 * size :]
+        if self.lags:
+            mount = MOUNTS_AGO[size](mount, observer[2 * size], self.past)[0]
+        return observer[:size], mount, observer[2 * size + self.lags :]
 
     def composed(self, map_: Map, robot: int) -> tuple[Array, Array, Array]:
         """Return the sensor's pose T (3,) or (7,) in the map's frame, T_r and T_s (dof, dof)."""
@@ -242,7 +253,7 @@ class Channel:
 
     def calibrated(self, map_: Map) -> Any:
         """Return the sensor with its parameters as they are estimated."""
-        if self.mount < 0 or len(own := map_.mean(self.mount)[len(self.at) :]) == 0:
+        if self.mount < 0 or len(own := map_.mean(self.mount)[len(self.at) + self.lags :]) == 0:
             return self.sensor
         return self.sensor.with_parameters(own)
 
@@ -311,6 +322,10 @@ class Channel:
         if self.start_noise is not None and not own_noise:
             R = self.start_noise(y)[0]
         L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
+        if self.lags:
+            size = len(self.at)
+            _, B_s, B_lag = MOUNTS_AGO[size](observer[size : 2 * size], observer[2 * size], self.past)
+            L_h = np.concatenate([L_r[0], L_s[0] @ B_s, L_s[0] @ B_lag], axis=1)
         if len(own):  # y = h(v, p) stays what it is: V_p = -V_y E_p
             L_h = np.concatenate([L_h, -L_y[0] @ sensor.parameters_jacobian(v)[0]], axis=1)
         return l[0], L_h, kernels.quadratic(L_y[0], np.array(R, dtype=np.float64)) + prior[0]

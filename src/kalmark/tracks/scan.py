@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from kalmark.filter.map import Map
 from kalmark.geometry.spaces import Space
 from kalmark.report import Report
 from kalmark.tracks.channel import Channel, ObservationModel, Parts
+from kalmark.tracks.classes import add_report
 from kalmark.tracks.clones import Clones, Measurement
 from kalmark.tracks.track import ChannelKey, Tracks
 
@@ -65,6 +67,26 @@ class ScanContext:
     def key(self) -> ChannelKey:
         """Robot and sensor."""
         return self.event.robot, self.event.sensor
+
+    @property
+    def reported(self) -> tuple[str | None, ...] | None:
+        """The class that the sensor reports of each observation (K,); None where it reports none, or none count."""
+        return self.event.classes if self.channel.classes is not None else None
+
+    def class_distances(self, names: Sequence[Id], tentative: bool = False) -> tuple[Array, Array]:
+        """Return by how much the class that is reported adds to d2 of each pair (K, L), and of new landmarks (K,)."""
+        tracks = self.tracks.tentative if tentative else self.tracks.confirmed
+        if self.reported is None or self.channel.classes is None:
+            return np.zeros((len(self.y), len(names))), np.zeros(len(self.y))
+        known = [tracks[name].classes if name in tracks else {} for name in names]
+        return self.channel.classes.distances(self.reported, known)
+
+    def add_reports(self, names: Sequence[Any], rows: Iterable[int], used: Iterable[bool]) -> None:
+        """Add the classes that the observations `rows` (K,) report to their landmarks, where they were `used`."""
+        for name, k, fused in zip(names, rows, used, strict=True) if self.reported is not None else ():
+            track = self.tracks.confirmed.get(name) or self.tracks.tentative.get(name)
+            if fused and track is not None and self.reported is not None and self.channel.classes is not None:
+                add_report(track.classes, self.channel.classes, self.reported[k])
 
     @property
     def own_noise(self) -> bool:

@@ -14,6 +14,7 @@ from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.models.protocols import Landmark, Segmented
 from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
+from kalmark.tracks.classes import LogClasses
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.known_landmarks import KnownLandmarks
 from kalmark.tracks.looks import Looks
@@ -80,7 +81,7 @@ class Track:
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
     `entered` counts the changes of the map before it came into it.  A tentative one may be where sightings `of` a
     landmark have it that do not fit that: then `log_odds` are those that it is right, and `covisible` are the landmarks
-    entered before it that fitted meanwhile.
+    entered before it that fitted meanwhile.  `classes` are the log-likelihoods of the classes that it may be of.
     """
 
     id: Id
@@ -106,6 +107,7 @@ class Track:
     measurements: list[Measurement] = field(default_factory=list)
     of: Id | None = None
     entered: int = 0
+    classes: LogClasses = field(default_factory=dict)
 
     def restored(self) -> None:
         """Check the counts and the extent of a file.  Raises MapError."""
@@ -229,6 +231,8 @@ class Tracks:
             if name in self.confirmed:
                 self.confirmed[name].covisible.add(kept.id)
         kept.covisible |= gone.covisible
+        for name, log_p in gone.classes.items():
+            kept.classes[name] = kept.classes.get(name, 0.0) + log_p
 
     def count(self, names: Iterable[Any], used: Iterable[bool]) -> None:
         """Count observations that were used, each at its landmark; those of robots are not counted."""

@@ -114,6 +114,8 @@ function still() {
   if (PICTURE.truth && l.x.length)
     traces.push(marks({...boxed(l), text: l.id}, thin("cross", SPACE ? "#8b929c" : INK), [8, 3],
                       {name: `true landmarks${DATA.how}`, hovertemplate: `true %{text}: ${WHERE}<extra></extra>`}));
+  for (const [name, places] of Object.entries(DATA.classes))
+    traces.push(marks(boxed(places), {color: name}, [5, 2], {...skip, name}));
   if (DATA.unseenLandmarks.x.length)
     traces.push(marks(boxed(DATA.unseenLandmarks), thin("x", ALARM), [6, 3], {...skip, name: "landmarks not seen again"}));
   const known = DATA.knownLandmarks;

@@ -1,0 +1,62 @@
+"""The last motions of a robot, for sensors whose stamps are late: where the robot was when they saw what they show.
+
+The lag is estimated with the map, behind the mount of its sensor (`models/observe.py`).  About its mean the mount is
+where the motions of that time have it.  How it changes with the lag is the velocity at that time, of an interval before
+the one since the last scan: of the controls since then it would be correlated with their noise, which is in the
+innovation, too, and the lag would be wrong (errors in variables; an instrumental variable, Fuller 1987, section 1.4).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kalmark.arrays import Array
+from kalmark.geometry.pose_frames import ORIGIN
+from kalmark.models.observe import FOLLOW, sensor_pose
+
+TINY_S = 1e-9
+SIZES = {3: 3, 6: 7}  # of a pose, by the size of a twist
+KEPT_S = 3.0  # of motions: more than any lag, and some scans
+
+
+class PastMotion:
+    """The last motions of a robot: their `seconds` (N,) and `twists` (N, 3 or 6) in its frame, the last ones first.
+
+    `scanned` has the time in ns of the last scan of each sensor that lags, counted by the motions since.
+    """
+
+    seconds: Array
+    twists: Array
+    scanned: dict[str, float]
+
+    def __init__(self, dof: int) -> None:
+        self.seconds, self.twists, self.scanned = np.zeros(0), np.zeros((0, dof)), {}
+
+    def add(self, seconds: float, twist: Array) -> None:
+        """Add a motion of so many seconds with a twist (3 or 6,)."""
+        kept = int(np.searchsorted(np.cumsum(self.seconds), KEPT_S)) + 1
+        self.seconds = np.append(seconds, self.seconds[:kept])
+        self.twists = np.vstack([twist, self.twists[:kept]])
+        self.scanned = {name: ago + seconds for name, ago in self.scanned.items()}
+
+    def look_back(self, sensor: str, lag_s: float) -> Array:
+        """Return the lag, the twist (3 or 6,) that changes with it and where the robot was then (3 or 7,).
+
+        The place is in the frame of the robot now.  The scan is noted as the last one of its sensor.
+        """
+        since, self.scanned[sensor] = self.scanned.get(sensor, KEPT_S), 0.0
+        dof = self.twists.shape[1]
+        follow, place = FOLLOW[dof], ORIGIN[SIZES[dof]]
+        steps = self._within(0.0, lag_s) if lag_s > 0.0 else np.full(1, lag_s)
+        steps[-1] += max(lag_s - self.seconds.sum(), 0.0)  # before the first motion it went on alike
+        for seconds, twist in zip(steps.tolist(), self.twists, strict=False):
+            place = sensor_pose(place, follow(twist, -seconds)[0])[0] if seconds else place
+        from_s = max(lag_s - 0.5 * since, 0.0)
+        weights = self._within(from_s, from_s + since)
+        twist = weights @ self.twists / max(weights.sum(), TINY_S)
+        return np.concatenate([[lag_s], twist, place])
+
+    def _within(self, from_s: float, to_s: float) -> Array:
+        """Return the seconds (N,) of each motion that were so long ago."""
+        ends = np.cumsum(self.seconds)
+        return np.clip(np.minimum(ends, to_s) - np.maximum(ends - self.seconds, from_s), 0.0, None)
