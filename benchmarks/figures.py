@@ -457,6 +457,15 @@ def gaps() -> Iterator[Figure]:
                  row("without repeats", "{0} of {1}"))  # fmt: skip
 
 
+def race_track() -> Iterator[Figure]:
+    """Yield the maps of a race track."""
+    section, command = "A race track", "python benchmarks/race_track.py"
+    for fault in ("clean", "60 ms late", "slipping", "spun", "no classes"):
+        name = f"{fault}: laps with each cone once / path RMSE, m (worst) / at the end / a scan, ms (worst)"
+        wanted = "95 % / .3 / .3 / 4 (20)"
+        yield Figure(section, name, wanted, command, row(fault, "{0} of {2} / {5} {6} / {7} {8} / {9} {10}"))
+
+
 def diagnosis() -> Iterator[Figure]:
     """Yield what the diagnosis names."""
     section, command = "Diagnosis", "python benchmarks/diagnosis.py"
@@ -813,6 +822,7 @@ def figures() -> list[Figure]:
         unknown_ids,
         gaps,
         storms,
+        race_track,
         diagnosis,
         outliers,
         tuning,

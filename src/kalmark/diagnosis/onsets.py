@@ -15,7 +15,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
 from kalmark.batch.problem import Factor
-from kalmark.diagnosis.causes import LEAST_GAIN, LEAST_INFORMATION, SEEN, SHOWS, Finding, systematic
+from kalmark.diagnosis.causes import LEAST_GAIN, LEAST_INFORMATION, SEEN, Finding, systematic
 from kalmark.diagnosis.error_columns import Column
 from kalmark.diagnosis.linear import Linear
 from kalmark.events import Control, Event, Scan
@@ -27,12 +27,13 @@ from kalmark.results.run import Run
 TURNED = "mount"  # the cause that a sensor was turned
 STRETCHES, ROUNDS = 20, 4  # in which the time is looked for, and how often within the best of them
 TRIED = 3  # errors whose time is looked for
+ALONE = 0.9  # of what an error of its own in each stretch explains, the share that one in a part of the run has to
 
 
 def find_onsets(linear: Linear, columns: list[Column], t_s: Array) -> list[Finding]:
     """Return the systematic errors that explain most in a part of the run, and clearly more than all the time.
 
-    `t_s` (n,) are the times of the poses.  An error that is smaller than the noise of a sighting or a step is none: a
+    `t_s` (n,) are the times of the poses.  Where other stretches have as much to explain the error did not begin: a
     calibration drifts.  `p` counts that the times were looked for.
     """
     row_s, step_s = _times(linear, t_s)
@@ -57,13 +58,14 @@ def _times(linear: Linear, t_s: Array) -> tuple[Array, Array]:
 
 
 def _passing(linear: Linear, column: Column, t_s: Array) -> Iterator[Finding]:
-    """Yield an error in the best part of a run, if that explains clearly more than all of it and is seen at once."""
+    """Yield an error in the best part of a run, if that explains clearly more than all of it, and little is left."""
     row_s, step_s = _times(linear, t_s)
     times = np.sort(np.concatenate([row_s[column.Z != 0.0], step_s[column.W != 0.0]]))[SEEN:-SEEN]
     if len(times) < STRETCHES:
         return
     gain, begin_s, end_s = _best_part(linear, column, row_s, step_s, np.unique(times))
-    if gain <= LEAST_GAIN + max((one.gain for one in systematic(linear, [column])), default=0.0):
+    steady = max((one.gain for one in systematic(linear, [column])), default=0.0)
+    if gain <= LEAST_GAIN + steady or gain < ALONE * _piecewise_gain(linear, column, row_s, step_s, times):
         return
     Z, W = (
         np.where((begin_s <= of_s) & (of_s < end_s), part, 0.0)
@@ -71,16 +73,12 @@ def _passing(linear: Linear, column: Column, t_s: Array) -> Iterator[Finding]:
     )
     part = column._replace(Z=Z, W=W, most=math.inf if W.any() else column.most)  # wheels may spin
     for one in systematic(linear, [part]):
-        variance = linear.root.power(2).sum(axis=1)
-        by_steps = W[variance > 0.0] ** 2 / variance[variance > 0.0]
-        shown = np.concatenate([Z[Z != 0.0] ** 2, by_steps[by_steps != 0.0]]) * one.value**2
-        if float(shown.mean()) > SHOWS**2:
-            p = min(1.0, one.p * len(times) * (1 if end_s == math.inf else len(times)))
-            if W.any():  # an error of a step begins and ends at the pose before, in the same segment of the run
-                usual_s = float(np.median(np.diff(np.unique(t_s))))
-                begin_s = max(float(t_s[t_s < begin_s].max(initial=0.0)), begin_s - usual_s)
-                end_s = float(t_s[t_s < end_s].max()) if end_s < math.inf else end_s
-            yield replace(one, p=p, since_s=begin_s, until_s=end_s)
+        p = min(1.0, one.p * len(times) * (1 if end_s == math.inf else len(times)))
+        if W.any():  # an error of a step begins and ends at the pose before, in the same segment of the run
+            usual_s = float(np.median(np.diff(np.unique(t_s))))
+            begin_s = max(float(t_s[t_s < begin_s].max(initial=0.0)), begin_s - usual_s)
+            end_s = float(t_s[t_s < end_s].max()) if end_s < math.inf else end_s
+        yield replace(one, p=p, since_s=begin_s, until_s=end_s)
 
 
 def turned_mounts(linear: Linear) -> Iterator[Column]:
@@ -151,17 +149,29 @@ def _gains(linear: Linear, column: Column, row_s: Array, step_s: Array, edges: A
 
     The stretches begin at `edges` (S,).
     """
+    g, I = _scores(linear, column, row_s, step_s, edges)
+    g = np.append(0.0, np.cumsum(g))
+    I = np.pad(np.cumsum(np.cumsum(I, axis=0), axis=1), ((1, 0), (1, 0)))
+    most = I.diagonal()
+    g, I = g[1:] - g[:-1, None], most[1:] + most[:-1, None] - I[:-1, 1:] - I[1:, :-1].T
+    enough = np.triu(LEAST_INFORMATION * most.max(initial=0.0) < I)
+    return np.asarray(np.where(enough, 0.5 * g * g / np.where(enough, I, 1.0), 0.0))
+
+
+def _scores(linear: Linear, column: Column, row_s: Array, step_s: Array, edges: Array) -> tuple[Array, Array]:
+    """Return the scores g (S,) of an error in each stretch, and their information I (S, S)."""
     Z, W = (
         np.where((np.searchsorted(edges, of_s, side="right") - 1)[:, None] == np.arange(len(edges)), of[:, None], 0.0)
         for of_s, of in ((row_s, column.Z), (step_s, column.W))
     )
     left, have = linear.left(Z, W), linear.residuals
-    g = np.append(0.0, np.cumsum(Z.T @ have.r + W.T @ have.m))
-    I = np.pad(np.cumsum(np.cumsum(Z.T @ left.r + W.T @ left.m, axis=0), axis=1), ((1, 0), (1, 0)))
-    most = I.diagonal()
-    g, I = g[1:] - g[:-1, None], most[1:] + most[:-1, None] - I[:-1, 1:] - I[1:, :-1].T
-    enough = np.triu(LEAST_INFORMATION * most.max(initial=0.0) < I)
-    return np.asarray(np.where(enough, 0.5 * g * g / np.where(enough, I, 1.0), 0.0))
+    return Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m
+
+
+def _piecewise_gain(linear: Linear, column: Column, row_s: Array, step_s: Array, times: Array) -> float:
+    """Return the gain of an error that has another value in each stretch."""
+    g, I = _scores(linear, column, row_s, step_s, times[_evenly(times, STRETCHES)])
+    return float(0.5 * g @ np.linalg.pinv(0.5 * (I + I.T), LEAST_INFORMATION, hermitian=True) @ g)
 
 
 # ------------------------------------------------------------------ the log without it

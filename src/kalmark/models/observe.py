@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numba import types
@@ -71,7 +71,9 @@ LINKS = signature_of(
 )
 call_linearize, call_sensor_at = by_address(LINEARIZE), by_address(SENSOR_AT)
 call_compose, call_links, call_mount_ago = by_address(COMPOSE), by_address(LINKS), by_address(MOUNT_AGO)
-MOUNT, AGO, PAST = 9, 12, 13  # where a view has the mount, the mount some time ago, and the past of its robot
+MOUNT: Final = 9  # where a view has the mount,
+AGO: Final = 12  # the mount some time ago,
+PAST: Final = 13  # and the past of its robot
 
 # of the state r (size,), the control u (m,), parameters and seconds: the new r, R_r (dof, dof), R_u (dof, m)
 MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")

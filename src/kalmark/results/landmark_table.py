@@ -340,8 +340,8 @@ class MapLandmarks:
                 except (KeyError, TypeError, ValueError) as error:
                     raise RunError(f"{path}:{number}: not a row of a landmark table: {error}") from None
         in_space = table.in_space and not plane
-        of = {"exact": frozenset(exact), "log_odds": odds, "unseen": frozenset(unseen), "classes": of_class}
-        return replace(table, in_space=in_space, **of)
+        table = replace(table, in_space=in_space, exact=frozenset(exact), log_odds=odds)
+        return replace(table, unseen=frozenset(unseen), classes=of_class)
 
 
 def refuse_other_than_points(slam: Slam, what: str, *, walls: bool = False) -> None:

@@ -167,7 +167,7 @@ class Mount:
             return None
         means, covs = [self.at], [np.zeros((dof, dof)) if cov is None else cov]
         if self.lags:
-            means, covs = [*means, [self.lag_s]], [*covs, [[self.sigma_lag_s**2]]]
+            means, covs = [*means, np.array([self.lag_s])], [*covs, np.array([[self.sigma_lag_s**2]])]
         if own is not None:
             means, covs = [*means, self.sensor.parameters], [*covs, own]  # type: ignore[attr-defined]
         mean = np.concatenate(means)
