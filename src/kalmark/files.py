@@ -34,6 +34,7 @@ from kalmark.errors import KalmarkError
 STALE_S = 3600.0  # older than this, what is beside a result was left by a program that was killed
 POLL_S = 0.05  # between two tests of a lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux
+DEEPEST = 12  # levels of a YAML file: a configuration has 5
 MOST_NODES = 1_000_000  # of a YAML file, its aliases counted as what they stand for
 PIECE = 1 << 20  # bytes that are unpacked at once
 FREE_BYTES = 1 << 26  # of an archive: what it may unpack to, whatever its own size
@@ -243,19 +244,17 @@ def _array(data: bytes) -> Any:
 
 
 def refuse_aliases(content: Any, where: str, error: type[KalmarkError]) -> None:
-    """Refuse the content of a YAML file whose aliases make far more of it than is written there."""
-    sizes: dict[int, int] = {}
-
-    def size(node: Any) -> int:
-        if not isinstance(node, dict | list):
-            return 1
-        if id(node) not in sizes:
-            sizes[id(node)] = MOST_NODES + 1  # of what holds itself
-            sizes[id(node)] = 1 + sum(map(size, node.values() if isinstance(node, dict) else node))
-        return sizes[id(node)]
-
-    if size(content) > MOST_NODES:
-        raise error(f"{where}: its aliases make more than {MOST_NODES} values of it, expected fewer")
+    """Refuse the content of a YAML file that is nested too deeply, or whose aliases make far more of it than it has."""
+    waiting, count = [(content, 0)], 0
+    while waiting:
+        node, depth = waiting.pop()
+        count += 1
+        if depth > DEEPEST:  # an alias to what it is in has no end
+            raise error(f"{where}: nested deeper than {DEEPEST} levels, expected fewer")
+        if count > MOST_NODES:
+            raise error(f"{where}: its aliases make more than {MOST_NODES} values of it, expected fewer")
+        below = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+        waiting += [(each, depth + 1) for each in below]
 
 
 def unpack_file(path: Path, error: type[KalmarkError]) -> Iterator[bytes]:

@@ -258,7 +258,7 @@ def test_euroc_has_the_unit_as_robot_and_starts_in_the_true_state(tmp_path: Path
     assert (mount["x_m"], mount["yaw_deg"]) == pytest.approx((0.1, 90.0))
     assert "imu0" not in str(km.open_log(tmp_path / "V1" / "mav0", imu="none").events[0])
     assert "estimator" not in log.describes  # the default
-    assert "no camera 'cam1', expected cam0" in refused(tmp_path / "V1", cameras=["cam1"])
+    assert "no camera 'cam1', expected one of cam0" in refused(tmp_path / "V1", cameras=["cam1"])
 
 
 def test_euroc_without_truth_starts_at_rest_with_all_readings_before(tmp_path: Path) -> None:
@@ -268,7 +268,7 @@ def test_euroc_without_truth_starts_at_rest_with_all_readings_before(tmp_path: P
     data = tmp_path / "mav0" / "imu0" / "data.csv"
     data.write_text(data.read_text() + f"{T0},0,0,0,0,0,9\n")
     assert "imu0/data.csv:42: " in refused(tmp_path)
-    assert "expected 7 cells: increasing times in ns, and finite numbers" in refused(tmp_path)
+    assert " ns is not after the one before, expected increasing times" in refused(tmp_path)
 
 
 # ------------------------------------------------------------------ bags

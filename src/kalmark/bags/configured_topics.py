@@ -9,6 +9,7 @@ from kalmark.bags.messages import MESSAGES, Message, Seen
 from kalmark.bags.opening import UNDEFINED, Bag, Received
 from kalmark.bags.topics import Carried, Compass, Imu, Posed, Topic
 from kalmark.errors import LogError
+from kalmark.logs.log import Names
 
 beams_of: Callable[..., Seen] | None = MESSAGES["sensor_msgs/msg/LaserScan"].seen
 
@@ -59,9 +60,9 @@ class Asked:
         """Return the entries of the configuration that a message's topic has."""
         return [name for name, topic in self.named.items() if topic == received.topic]
 
-    def _controls(self) -> dict[str, tuple[str, ...]]:
+    def _controls(self) -> dict[str, Names]:
         """Return the columns of each robot's controls.  Raises LogError if two topics are those of one robot."""
-        columns: dict[str, tuple[str, ...]] = {}
+        columns: dict[str, Names] = {}
         named: dict[str, str] = {}
         for name, topic in self.topics.items():
             if topic.columns and topic.robot in columns:

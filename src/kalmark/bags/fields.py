@@ -21,6 +21,7 @@ from kalmark.bags.messages import MESSAGES, Measured, Message, Seen, first_id
 from kalmark.bags.topics import Scans, Topic
 from kalmark.errors import LogError
 from kalmark.events import short_text, unit_quaternion
+from kalmark.logs.log import Names
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import CANONICAL, FACTORS, GLOBE, INERTIAL, POSE3, POSITION, TWIST3
 
@@ -114,7 +115,7 @@ class Fields:
             seen.add(y, first_id(scan, table[ID][k]) if ID in table else scan.landmark)
         return seen
 
-    def numbers(self, m: Any, columns: tuple[str, ...], absent: float = 0.0) -> Array:
+    def numbers(self, m: Any, columns: Names, absent: float = 0.0) -> Array:
         """Return one number of each column, `absent` where no field is named.  Raises Refused."""
         table = self.table(m)
         if any(len(each) != 1 for each in table.values()):

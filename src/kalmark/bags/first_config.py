@@ -14,8 +14,9 @@ from kalmark.bags.first_sensors import CLUSTERS, IDS, entry_of, is_tag, section_
 from kalmark.bags.first_start import POSE_M, start_of
 from kalmark.bags.first_words import GUESS, Entry, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.importer import DAY_NS
-from kalmark.bags.survey import Survey, TopicSummary, yaw
+from kalmark.bags.survey import Poses, Survey, TopicSummary, yaw
 from kalmark.bags.tf_frames import BASES
+from kalmark.logs.log import Section
 from kalmark.logs.table_columns import BEAM, CORNERS, POSE3
 
 TRUE = ("truth", "vicon", "mocap", "optitrack", "/gt", "gt_", "_gt")
@@ -160,7 +161,7 @@ class _Writer:
         ]
         lines = []
         if kind:
-            car: dict[str, Any] = {"wheelbase_m": 2.83, "encoder_offset_m": 0.0} if kind == "ackermann" else {}
+            car: Section = {"wheelbase_m": 2.83, "encoder_offset_m": 0.0} if kind == "ackermann" else {}
             why = f"{GUESS} its wheelbase; " if car else ""
             if kind == "inertial":
                 car, why = {"preset": "mems_imu"}, f"{GUESS} a small unit, whose frame is the robot's; "
@@ -193,7 +194,7 @@ class _Writer:
         used: dict[str, Entry] = {}
         if isinstance(control, TopicSummary):
             slow = control.offers.pose is not None and any(scan.rate_hz > SLOW * control.rate_hz for scan in scans)
-            entry: dict[str, Any] = {"type": kind} | ({"at": "scans"} if slow and "odometry" in kind else {})
+            entry: Section = {"type": kind} | ({"at": "scans"} if slow and "odometry" in kind else {})
             used[control.name] = (entry, self.of_control(control))
         elif control is not None:
             entry = {"type": kind, "frame": control[0], "child_frame": control[1]}
@@ -219,20 +220,23 @@ class _Writer:
         estimated = [t for t in topics if not _has_word(t, TRUE)]
         odometries = [t for t in estimated if t.offers.twist and t.offers.pose and t.poses.frames]
         odometries.sort(key=lambda t: (not t.poses.moves, _has_word(t, LATER), t.name))
+        velocity = "unicycle" if flat else "velocity_3d"
+
+        def odometry(poses: Poses) -> str:
+            return "odometry_2d" if flat and poses.flat else "odometry_3d"
+
         for topic in odometries[:1]:
-            if topic.turns and not topic.poses.moves:
-                return topic, "unicycle" if flat else "velocity_3d"
-            return topic, "odometry_2d" if flat and topic.poses.flat else "odometry_3d"
+            return topic, velocity if topic.turns and not topic.poses.moves else odometry(topic.poses)
         for pair, poses in self.found.pairs.items():
             whose = pair[1].split("/")[0] == robot if self.spaces else True
             if any(map(_has_frames, self.usable)) and _is_odometry(*pair) and whose:
-                return pair, "odometry_2d" if flat and poses.flat else "odometry_3d"
+                return pair, odometry(poses)
         for topic in (t for t in topics if t.offers.drive):
             return topic, "ackermann"
         for topic in sorted((t for t in topics if t.offers.twist), key=lambda t: ("cmd" in t.name, t.name)):
-            return topic, "unicycle" if flat else "velocity_3d"
+            return topic, velocity
         for topic in (t for t in estimated if t.offers.pose and not t.offers.noisy and _is_path(t)):
-            return topic, "odometry_2d" if flat and topic.poses.flat else "odometry_3d"
+            return topic, odometry(topic.poses)
         return None, ""
 
     def inertial(self, topics: Sequence[TopicSummary]) -> tuple[TopicSummary | None, str]:
@@ -259,7 +263,7 @@ class _Writer:
         if topic.offers.globe is not None and topic.origin is not None:
             if _has_word(topic, TRUE):
                 return {"type": "truth"}, f"{topic_text(topic)}; {GUESS} by its name: its positions only score"
-            entry: dict[str, Any] = {"type": "fix", "origin": [float(v) for v in topic.origin]}
+            entry: Section = {"type": "fix", "origin": [float(v) for v in topic.origin]}
             if topic.poses.cov is None:
                 why = f"{topic_text(topic)}; {GUESS} sigma_m, as the receiver has no covariance"
                 return entry | {"sigma_m": SATELLITE_M}, why

@@ -20,6 +20,7 @@ from kalmark.bags.tf_mounts import LEVEL
 from kalmark.bags.topics import Scans
 from kalmark.geometry import rotations
 from kalmark.geometry.named_poses import describe_pose
+from kalmark.logs.log import Section
 
 HEADING_S, HEADING_RAD = 1.0, 0.02
 """Headings are taken so often, and are not believed to be better: errors of a compass last."""
@@ -77,7 +78,7 @@ class Readings:
         self.tilted[topic.frame] = np.append(np.zeros(3), turn)
         return self.tilted[topic.frame]
 
-    def tilt(self, topic: TopicSummary) -> dict[str, Any]:
+    def tilt(self, topic: TopicSummary) -> Section:
         """Return the comment of an entry on a mount by gravity."""
         if mount_of(self.found, topic, self.control) is not None or (mount := self.mount(topic)) is None:
             return {}
@@ -92,9 +93,9 @@ class Readings:
             return "headings by a magnetic field are for the plane, and for robots without another heading"
         return ""
 
-    def unit(self, topic: TopicSummary) -> dict[str, Any] | None:
+    def unit(self, topic: TopicSummary) -> Section | None:
         """Return the entry of an inertial unit, None if nothing of it is taken; note its sensors."""
-        entry: dict[str, Any] = {"type": "imu"}
+        entry: Section = {"type": "imu"}
         rates, attitude = topic.first.get("rates"), topic.first.get("attitude")
         spread = None if attitude is None or attitude.cov is None else np.diagonal(attitude.cov)
         level = self.space and spread is not None and spread[:2].min() > 0
@@ -113,7 +114,7 @@ class Readings:
             entry["every_s"] = HEADING_S
         return None if entry == {"type": "imu", "gyro": None} else entry
 
-    def gyro(self, topic: TopicSummary, rates: Measured) -> dict[str, Any]:
+    def gyro(self, topic: TopicSummary, rates: Measured) -> Section:
         """Return the comment of an entry on the rates; record their sensor."""
         name = self.named("gyro", topic)
         sigma, why = GYRO_RADPS, f"{GUESS} its noise and its bias"
@@ -128,7 +129,7 @@ class Readings:
         self.line(name, {"type": "gyro", "sigma_radps": sigma} | BIAS, topic, why)
         return {"gyro": name} | at
 
-    def compass(self, topic: TopicSummary) -> dict[str, Any]:
+    def compass(self, topic: TopicSummary) -> Section:
         """Return the entry of a magnetic field; note its sensor."""
         name = self.named("compass", topic)
         self.compass_line(name, topic, topic.first["field"].v, FIELD_RAD)
@@ -140,7 +141,7 @@ class Readings:
         R = np.eye(3) if mount is None else rotations.matrix(np.array(mount[3:]))
         heading = heading_of(v, np.eye(3) if self.space else R) if len(v) == 4 else heading_of_field(R @ v)
         self.heading = heading if self.heading is None else self.heading
-        section: dict[str, Any] = {"type": "heading", "sigma_heading_rad": sigma}
+        section: Section = {"type": "heading", "sigma_heading_rad": sigma}
         if self.begin is not None and self.begin.north:
             section |= {"declination_rad": 0.0, "sigma_declination_rad": NORTH_RAD}
             self.line(name, section, topic, f"{GUESS} its north is true north, or nearly")
@@ -167,7 +168,7 @@ class Readings:
         self.taken.add(name)
         return name
 
-    def line(self, name: str, section: dict[str, Any], topic: TopicSummary, why: str) -> None:
+    def line(self, name: str, section: Section, topic: TopicSummary, why: str) -> None:
         """Note the line of a sensor; a mount that tf does not have is to be given where it counts."""
         if mount_of(self.found, topic, self.control) is not None:
             why = f"{why}; its mount is that of tf"

@@ -11,6 +11,7 @@ from kalmark.bags.survey import Survey, TopicSummary
 from kalmark.bags.topics import Scans
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.pose_frames import ORIGIN
+from kalmark.logs.log import Section
 from kalmark.logs.table_columns import BEAM, CORNERS, POSE3, POSITION
 
 CAMERA = {"fx_px": 600.0, "fy_px": 600.0, "cx_px": 640.0, "cy_px": 512.0, "width_px": 1280, "height_px": 1024}
@@ -22,9 +23,9 @@ def is_tag(topic: TopicSummary) -> bool:
     return topic.what.endswith("of tags")
 
 
-def entry_of(topic: TopicSummary, space: bool) -> dict[str, Any]:
+def entry_of(topic: TopicSummary, space: bool) -> Section:
     """Return the entry of a topic of observations."""
-    entry: dict[str, Any] = {"type": "scan", "sensor": sensor_name(topic.name, Scans())}
+    entry: Section = {"type": "scan", "sensor": sensor_name(topic.name, Scans())}
     for key, names in (("ids", IDS), ("clusters", CLUSTERS)):
         name = next((each for each in topic.fields if each in names), None)
         if name and not {"ids", "clusters"} & entry.keys():
@@ -60,7 +61,7 @@ def mount_of(found: Survey, topic: TopicSummary, control: Any) -> Array | None:
     return None if base is None else found.frames.fixed(base, topic.frame)
 
 
-def sensor_section(found: Survey, topic: TopicSummary, space: bool) -> tuple[dict[str, Any], str]:
+def sensor_section(found: Survey, topic: TopicSummary, space: bool) -> tuple[Section, str]:
     """Return a sensor's section, and why."""
     columns = topic.columns
     if columns[:2] == BEAM and not topic.stated:
@@ -81,7 +82,7 @@ def sensor_section(found: Survey, topic: TopicSummary, space: bool) -> tuple[dic
     return {"type": kind} | named, ""
 
 
-def camera_of_topic(found: Survey, topic: TopicSummary) -> tuple[dict[str, Any], str]:
+def camera_of_topic(found: Survey, topic: TopicSummary) -> tuple[Section, str]:
     """Return the numbers of the camera of a topic, by the CameraInfo of its frame, or else the only one, and why."""
     infos = [each for each in found.topics if each.offers.camera is not None and each.count]
     mine = [each for each in infos if each.frame == topic.frame] or infos

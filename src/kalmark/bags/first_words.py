@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from kalmark.bags.configured_topics import short
 from kalmark.bags.survey import TopicSummary
+from kalmark.logs.log import Section
 
 GUESS = "GUESS:"
-Entry = tuple[dict[str, Any], str]
+Entry = tuple[Section, str]
 """The entry of a topic in a configuration, and the reason for it."""
 
 
@@ -19,7 +19,7 @@ def yaml_text(text: str) -> str:
     return text if plain and text not in ("true", "false", "null", "yes", "no", "on", "off") else f"'{text}'"
 
 
-def yaml_mapping(values: dict[str, Any]) -> str:
+def yaml_mapping(values: Section) -> str:
     """Return a mapping on one line of YAML."""
     parts = []
     for key, value in values.items():

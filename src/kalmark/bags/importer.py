@@ -45,7 +45,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.geodesy import fault, to_tangent_plane
 from kalmark.logs.image_files import Forward
-from kalmark.logs.log import Log, PositionTrack, Trajectory, poses_of_size
+from kalmark.logs.log import Log, Names, PositionTrack, Section, SensorKey, Trajectory, poses_of_size
 from kalmark.logs.source import Format, Request
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import BEAM, POSE3, POSITION
@@ -97,7 +97,7 @@ class _Importer:
         self.origins: dict[str, Array] = {}
         self.received: Counter[str] = Counter()
         self.images: dict[str, Forward] = {}
-        self.cameras: dict[tuple[str, str], dict[str, Any]] = {}
+        self.cameras: dict[SensorKey, Section] = {}
         self.clocks: dict[bool, tuple[str, int]] = {}
 
     # -------------------------------------------------------------- messages
@@ -126,9 +126,9 @@ class _Importer:
             control_columns=self.asked.columns, sensor_columns=self.out.sensor_columns, describes=self.describes(),
         )  # fmt: skip
 
-    def describes(self) -> dict[str, Any]:
+    def describes(self) -> Section:
         """Return the motions by the topics' types, and the mounts of tf, in the shape of a configuration."""
-        robots: dict[str, dict[str, Any]] = {}
+        robots: dict[str, Section] = {}
         for topic in self.topics.values():
             if topic.columns:
                 robots.setdefault(topic.robot, {})["motion"] = {"type": registered_name(type(topic))}
@@ -333,7 +333,7 @@ class _Importer:
                 raise LogError(f"{self.bag.path}: {info}: {refused}") from None
             self.cameras[topic.robot, sensor_name(name, topic)] = {"type": "pinhole"} | numbers
 
-    def chosen(self, name: str, topic: Scans, seen: Seen) -> tuple[tuple[str, ...], Any]:
+    def chosen(self, name: str, topic: Scans, seen: Seen) -> tuple[Names, Any]:
         """Return the columns to take, and the observations (K, m), for a robot of the plane made level."""
         y = np.asarray(seen.y, dtype=np.float64).reshape(-1, len(seen.columns))
         R, turned = self.mounts.level.get(name, (np.eye(3), False))
@@ -365,7 +365,7 @@ def own_noise(m: Incoming, rows: list[int]) -> Array | None:
     return cov[np.ix_(rows, rows)]
 
 
-def turned_at_all(columns: tuple[str, ...], y: Array) -> Array:
+def turned_at_all(columns: Names, y: Array) -> Array:
     """Return observations (K, m) whose rotations, if they are taken, are there.  Raises Refused."""
     if np.isnan(y[:, [column in POSE3[3:] for column in columns]]).any():
         raise Refused(f"{NO_ROTATION}, or `take: [{', '.join(POSITION)}]`")

@@ -24,6 +24,8 @@ float64[] covariance
 """
 LATEST_S = 2**31 - 1  # a header's seconds are int32
 
+MessageFields = dict[str, Any]  # of a message, by name
+
 
 class Outgoing(NamedTuple):
     """One message to write: its topic, its type, the time (ns) under which it is recorded, and its fields."""
@@ -31,7 +33,7 @@ class Outgoing(NamedTuple):
     topic: str
     type: str
     t_ns: int
-    fields: dict[str, Any]
+    fields: MessageFields
 
 
 class Types:
@@ -45,7 +47,7 @@ class Types:
         self.store: Any = get_typestore(Stores.ROS2_HUMBLE) if store is None else store
         self.store.register(get_types_from_msg(RECORD_FIELDS, RECORD))
 
-    def made(self, kind: str, fields: dict[str, Any]) -> Any:
+    def made(self, kind: str, fields: MessageFields) -> Any:
         """Return a message of a type."""
         _, described = self.store.fielddefs[kind]
         return self.store.types[kind](**{name: self._value(one, fields.get(name)) for name, one in described})
@@ -68,7 +70,7 @@ class Types:
         return [self._value(detail[0], each) for each in value or ()]
 
 
-def header_fields(t_ns: int, frame: str = "") -> dict[str, Any]:
+def header_fields(t_ns: int, frame: str = "") -> MessageFields:
     """Return the fields of a std_msgs/Header; a time that it cannot hold is the nearest that it can."""
     return {"stamp": time_fields(t_ns), "frame_id": frame}
 

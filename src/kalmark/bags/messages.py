@@ -22,6 +22,7 @@ from kalmark.bags.opening import header_time
 from kalmark.bags.topics import Scans
 from kalmark.events import unit_quaternion
 from kalmark.logs.camera_calibration import lens
+from kalmark.logs.log import Names, Section
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import BEAM, CORNERS, POSE3, POSITION
 
@@ -43,7 +44,7 @@ class Measured(NamedTuple):
 class Seen:
     """Part of a scan in one message: rows in the order of `columns`, ids, and numbers of left-out rows by reason."""
 
-    columns: tuple[str, ...]
+    columns: Names
     y: list[list[float]] | Array = field(default_factory=list)
     ids: list[Any] = field(default_factory=list)
     left_out: Counter[str] = field(default_factory=Counter)
@@ -57,7 +58,7 @@ class Seen:
         self.ids.append(id_)
 
     @classmethod
-    def of(cls, columns: tuple[str, ...], rows: Iterable[tuple[Iterable[float], Any]]) -> Seen:
+    def of(cls, columns: Names, rows: Iterable[tuple[Iterable[float], Any]]) -> Seen:
         """Return the observations of these numbers and ids."""
         seen = cls(columns)
         for y, id_ in rows:
@@ -107,7 +108,7 @@ class Message:
     force: Reads = None
     field: Reads = None
     transforms: Callable[[Any], list[Transform]] | None = None
-    camera: Callable[[Any], dict[str, Any]] | None = None
+    camera: Callable[[Any], Section] | None = None
     image: Callable[[Any], Any] | None = None
 
 
@@ -205,13 +206,13 @@ def transform(m: Any) -> Transform:
     return Transform(header_time(m), m.header.frame_id.lstrip("/"), m.child_frame_id.lstrip("/"), frame)
 
 
-def camera(m: Any) -> dict[str, Any]:
+def camera(m: Any) -> Section:
     """Return the keys of a camera's section for a sensor_msgs/CameraInfo, whose matrix is K in ROS 1, k in ROS 2.
 
     Raises Refused: of a camera that is not calibrated, and of a lens that kalmark does not have.
     """
     K, D = ([float(v) for v in getattr(m, name, getattr(m, name.upper(), ()))] for name in "kd")
-    section: dict[str, Any] = {"fx_px": K[0], "fy_px": K[4], "cx_px": K[2], "cy_px": K[5]}
+    section: Section = {"fx_px": K[0], "fy_px": K[4], "cx_px": K[2], "cy_px": K[5]}
     section |= {"width_px": int(m.width), "height_px": int(m.height)}
     if not (K[0] > 0 and K[4] > 0):
         raise Refused(f"focal lengths {K[0]:g}, {K[4]:g} of a camera that is not calibrated, expected numbers > 0")
@@ -267,7 +268,7 @@ def beams(m: Any, scan: Scans) -> Seen:
     r = np.asarray(m.ranges, dtype=np.float64)
     a = float(m.angle_min) + float(m.angle_increment) * np.arange(len(r))
     intensities = np.asarray(m.intensities, dtype=np.float64)
-    columns: tuple[str, ...] = BEAM
+    columns: Names = BEAM
     rows = np.column_stack([r, a])
     if len(r) and len(intensities) == len(r):
         columns, rows = (*BEAM, "intensity"), np.column_stack([rows, intensities])

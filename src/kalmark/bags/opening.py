@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 from kalmark.errors import LogError
 from kalmark.events import short_text
 from kalmark.files import unpack_file
-from kalmark.logs.source import spelling_hint
+from kalmark.logs.source import reason_of, spelling_hint
 from kalmark.logs.table import Refused
 
 ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
@@ -111,11 +111,8 @@ class Bag:
                     raise ValueError("expected a name PACKAGE/TYPE")
                 made = get_types_from_msg(text, name)
             except Exception as error:  # rosbags has no common error of texts that are no definitions
-                reason = " ".join(str(error).split())[:120]
-                raise LogError(
-                    f"log option definitions: {kind} is {short_text(given)}, "
-                    f"expected a .msg file or its text ({reason})"
-                ) from None
+                what = f"expected a .msg file or its text ({reason_of(error, 120)})"
+                raise LogError(f"log option definitions: {kind} is {short_text(given)}, {what}") from None
             known.register({each: fields for each, fields in made.items() if each not in known.fielddefs})
         if self._given:  # what these are made of
             usual = get_typestore(Stores.LATEST).fielddefs
@@ -135,10 +132,9 @@ class Bag:
         return bag
 
     def _damaged(self, error: Exception) -> LogError:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        if cure := next((cure for said, cure in CURES.items() if said in reason), ""):
+        if cure := next((cure for said, cure in CURES.items() if said in str(error)), ""):
             return LogError(f"{self.path}: {cure}")
-        return LogError(f"{self.path}: not a bag that can be read ({reason[:160].rstrip('.')}), {EXPECTED}")
+        return LogError(f"{self.path}: not a bag that can be read ({reason_of(error).rstrip('.')}), {EXPECTED}")
 
     def find(self, name: str) -> str:
         """Return a topic's name as the bag has it, with or without its first slash.  Raises LogError."""
@@ -164,10 +160,9 @@ class Bag:
                         f"{self.path}: topic {connection.topic} has messages of the type {connection.msgtype}, "
                         f"{UNDEFINED}"
                     ) from None
-                reason = " ".join(str(error).split())[:120] or type(error).__name__
                 raise LogError(
                     f"{self.path}: the message of {connection.topic} recorded at {recorded_ns} ns is no "
-                    f"{connection.msgtype} ({reason})"
+                    f"{connection.msgtype} ({reason_of(error, 120)})"
                 ) from None
             yield Received(connection.topic, connection.msgtype, int(recorded_ns), message)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from heapq import merge
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.bags import tables, view
-from kalmark.bags.mcap_writer import Outgoing, header_fields, write_mcap
+from kalmark.bags.mcap_writer import MessageFields, Outgoing, header_fields, write_mcap
 from kalmark.geometry.named_poses import pose_of
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import matrix
@@ -57,13 +57,13 @@ def pose_messages(run: Run, robot: str) -> Iterator[Outgoing]:
         yield diagnostics(t_ns, [status(run, robot, step, P[:dof, :dof])])
 
 
-def body_twist(mean: Array) -> dict[str, Any]:
+def body_twist(mean: Array) -> MessageFields:
     """Return the velocity of a state (13,) in the robot's frame; in the state it is in the world's."""
     v, w = matrix(np.ascontiguousarray(mean[3:7])).T @ mean[7:10], mean[10:13]
     return {name: dict(zip("xyz", part.tolist(), strict=True)) for name, part in (("linear", v), ("angular", w))}
 
 
-def tf(topic: str, t_ns: int, transforms: list[dict[str, Any]]) -> Outgoing:
+def tf(topic: str, t_ns: int, transforms: list[MessageFields]) -> Outgoing:
     """Return a message of frames."""
     return Outgoing(topic, "tf2_msgs/msg/TFMessage", t_ns, {"transforms": transforms})
 
@@ -96,7 +96,7 @@ def maps(run: Run) -> Iterator[Outgoing]:
         )
 
 
-def landmark_markers(kept: MapSnapshot) -> list[dict[str, Any]]:
+def landmark_markers(kept: MapSnapshot) -> list[MessageFields]:
     """Return the markers of one map."""
     if not len(kept.ids):
         return []
@@ -119,7 +119,7 @@ def landmark_markers(kept: MapSnapshot) -> list[dict[str, Any]]:
     return out
 
 
-def status(run: Run, robot: str, step: int, P: Array) -> dict[str, Any]:
+def status(run: Run, robot: str, step: int, P: Array) -> MessageFields:
     """Return the fields of a DiagnosticStatus: how many observations became what, and how sure the pose is."""
     history = run.history
     first, last = np.searchsorted(history.step, [step, step + 1])
@@ -146,7 +146,7 @@ def summary_message(run: Run) -> Outgoing:
     return diagnostics(int(run.history.t_ns[-1]) if len(run.history.t_ns) else 0, [told])
 
 
-def diagnostics(t_ns: int, told: list[dict[str, Any]]) -> Outgoing:
+def diagnostics(t_ns: int, told: list[MessageFields]) -> Outgoing:
     """Return a message of diagnostics."""
     fields = {"header": header_fields(t_ns), "status": told}
     return Outgoing("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", t_ns, fields)

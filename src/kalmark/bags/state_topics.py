@@ -16,6 +16,7 @@ from kalmark.bags.topics import Compass, Imu, Sparse, Topic
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, fixed_seconds
 from kalmark.geometry import rotations
+from kalmark.logs.log import Names, SensorKey
 from kalmark.logs.table import Refused
 
 
@@ -34,7 +35,7 @@ class Gathered:
     """Result of messages: events, the columns of sensors (robot, name), and numbers of left-out ones by reason."""
 
     events: list[Event] = field(default_factory=list)
-    sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+    sensor_columns: dict[SensorKey, Names] = field(default_factory=dict)
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
 
     def is_next(self, m: Incoming, before_ns: int | None, what: str) -> bool:
@@ -55,8 +56,8 @@ class OwnReadings:
 
     def __init__(self, out: Gathered, level: Mapping[str, tuple[Array, bool]], in_space: Callable[[str], bool]) -> None:
         self.out, self.level, self.in_space = out, level, in_space
-        self.rates: dict[tuple[str, str], dict[int, Array]] = {}
-        self.read_ns: dict[tuple[str, str], int] = {}
+        self.rates: dict[SensorKey, dict[int, Array]] = {}
+        self.read_ns: dict[SensorKey, int] = {}
 
     def take(self, m: Incoming, topic: Sparse) -> None:
         """Take what an inertial unit or a compass measured of its robot, of what is sparse only now and then."""
@@ -67,7 +68,7 @@ class OwnReadings:
             elif often or key not in self.read_ns or m.t_ns - self.read_ns[key] >= topic.every_s * 1e9:
                 self.reading(m, sensor, columns, y)
 
-    def said(self, m: Incoming, topic: Sparse) -> Iterator[tuple[str, tuple[str, ...], Any]]:
+    def said(self, m: Incoming, topic: Sparse) -> Iterator[tuple[str, Names, Any]]:
         """Yield the readings of a message, in the plane made level: sensor, columns and numbers."""
         R = self.level.get(m.name, (np.eye(3), False))[0]
         if isinstance(topic, Compass) and (b := self.measured(m, "field", m.offer.field)) is not None:
@@ -99,7 +100,7 @@ class OwnReadings:
             raise Refused(f"{what} {found.v.tolist()}, expected finite numbers")
         return found.v
 
-    def reading(self, m: Incoming, sensor: str, columns: tuple[str, ...], y: Any) -> None:
+    def reading(self, m: Incoming, sensor: str, columns: Names, y: Any) -> None:
         """Take a reading of a sensor of the robot itself: one at a time."""
         robot, t_ns = m.topic.robot, m.t_ns
         if self.read_ns.get((robot, sensor)) == t_ns:

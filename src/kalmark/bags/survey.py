@@ -17,6 +17,7 @@ from kalmark.bags.tables import holds_log
 from kalmark.bags.tf_frames import Frames
 from kalmark.bags.topics import Scans
 from kalmark.geometry import rotations
+from kalmark.logs.log import Names
 from kalmark.logs.table import Refused
 
 GAP = 5.0  # an interval longer than so many usual ones is a gap
@@ -82,8 +83,8 @@ class TopicSummary:
     back_s: float = 0.0
     error: str = ""
     poses: Poses = field(default_factory=Poses)
-    columns: tuple[str, ...] = ()
-    fields: tuple[str, ...] = ()
+    columns: Names = ()
+    fields: Names = ()
     stated: dict[str, str] = field(default_factory=dict)
     named: bool = False
     unset: bool = False

@@ -27,8 +27,8 @@ from kalmark.arrays import Array
 from kalmark.bags.mcap_writer import RECORD, Outgoing, header_fields
 from kalmark.bags.opening import Bag, Received
 from kalmark.errors import EventError, LogError
-from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event, sort_key
-from kalmark.logs.log import Log, PositionTrack, Trajectory
+from kalmark.events import Control, Event, Fix, Raw, Scan, label_of_event, sort_key
+from kalmark.logs.log import LandmarkPlaces, Log, PositionTrack, Trajectory
 from kalmark.logs.native_writer import id_text
 from kalmark.logs.source import Request, landmark_id
 from kalmark.logs.table_columns import GPS as GPS_COLUMNS
@@ -124,7 +124,7 @@ def read(bag: Bag, request: Request) -> Log:
     events: list[Event] = []
     truth: dict[str, dict[int, Array]] = {}
     gps: dict[str, list[tuple[int, Array]]] = {}
-    landmarks: dict[Id, Array] = {}
+    landmarks: LandmarkPlaces = {}
     about: dict[str, Any] = {}
     names = {LOG, CONTROLS, SCANS, FIXES, TRUTH, LANDMARKS, GPS}
     for received in bag.messages(names):

@@ -19,14 +19,14 @@ from kalmark.arrays import Array
 from kalmark.bags.opening import Bag, header_time
 from kalmark.declare import Within
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, sort_key, unit_quaternion
+from kalmark.events import Control, Event, Scan, sort_key, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import matrix
 from kalmark.logs.camera_calibration import INTRINSICS, lens
 from kalmark.logs.known_map import TAG, KnownLandmark
-from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.log import LandmarkPlaces, Log, Section, Trajectory
 from kalmark.logs.source import (
     Format,
     Request,
@@ -46,6 +46,7 @@ MOUNT_SIGMAS = {"sigma_position_m": 0.05, "sigma_rotation_deg": 3.0}  # of a cam
 MAX_HAMMING = 2
 SIGMA = 0.005
 """Of odometry, m and rad per square root of a second, where none is given: that of test 21 is 0.003."""
+Messages = list[tuple[str, Any]]  # topic, message
 LATE_NS = 1_000_000_000
 """The log begins where the reference does, if that is within this time of the first detection."""
 
@@ -72,7 +73,7 @@ class Scene:
     hamming: dict[str, int] = field(default_factory=dict)
     ignored: set[int] = field(default_factory=set)
     squashed: set[tuple[int, int]] = field(default_factory=set)
-    odometry: dict[str, dict[str, Any]] = field(default_factory=dict)
+    odometry: dict[str, Section] = field(default_factory=dict)
     pixel_noise: float = 1.0
 
     def size(self, tag: int) -> float | None:
@@ -108,7 +109,7 @@ def read_scene(path: Path) -> Scene:
     return scene
 
 
-def add_body(scene: Scene, name: str, body: dict[str, Any]) -> None:
+def add_body(scene: Scene, name: str, body: Section) -> None:
     """Add one body: its own tags, those of its board, the size of all others if it is the default body."""
     scene.static[name] = bool(body["is_static"])
     if "max_hamming_distance" in body:
@@ -127,13 +128,13 @@ def add_body(scene: Scene, name: str, body: dict[str, Any]) -> None:
         scene.odometry[name] = body
 
 
-def frame_of(pose: dict[str, Any]) -> Array:
+def frame_of(pose: Section) -> Array:
     """Return the frame (7,) of a pose as TagSLAM writes it: position and rotation vector, child in parent."""
     parts = [[float(pose[part][axis]) for axis in "xyz"] for part in ("position", "rotation")]
     return vector_frame(*parts)
 
 
-def read_cameras(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
+def read_cameras(folder: Path) -> tuple[dict[str, Section], dict[str, Array]]:
     """Return the cameras of cameras.yaml, and the poses in their body of those in camera_poses.yaml."""
     path = folder / "cameras.yaml"
     cameras, poses_path = read_mapping(path), folder / "camera_poses.yaml"
@@ -152,9 +153,9 @@ def read_cameras(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, Arr
         raise LogError(f"{poses_path}: {error!r}, expected poses with position and rotation") from None
 
 
-def described_camera(camera: dict[str, Any], mount: dict[str, float], pixel_noise: float) -> dict[str, Any]:
+def described_camera(camera: Section, mount: dict[str, float], pixel_noise: float) -> Section:
     """Return the section of one camera that sees tags."""
-    section: dict[str, Any] = {"type": "tag_corners"}
+    section: Section = {"type": "tag_corners"}
     section |= dict(zip(INTRINSICS, map(float, camera["intrinsics"]), strict=True))
     section |= dict(zip(("width_px", "height_px"), map(int, camera["resolution"]), strict=True))
     section |= lens(camera["distortion_model"], camera["distortion_coeffs"])
@@ -190,7 +191,7 @@ def surveyed_tags(path: Path, exact: bool = False) -> list[KnownLandmark]:
     return found
 
 
-def covariance_of_pose(pose: dict[str, Any]) -> Array:
+def covariance_of_pose(pose: Section) -> Array:
     """Return the covariance (6, 6) of a pose as TagSLAM writes it, of errors in the frame that it is in."""
     none = dict.fromkeys("xyz", 0.0)
     sigmas = [[float(pose.get(f"{part}_noise", none)[axis]) for axis in "xyz"] for part in ("position", "rotation")]
@@ -213,7 +214,7 @@ def find_bag(folder: Path, name: str) -> Path | None:
     return None
 
 
-def messages_of_bag(path: Path) -> list[tuple[str, Any]]:
+def messages_of_bag(path: Path) -> Messages:
     """Return (topic, message) of everything in a bag, as recorded.  Raises LogError if it cannot be read."""
     with Bag(path) as bag:
         return [(received.topic, received.message) for received in bag.messages(bag.topics)]
@@ -230,7 +231,7 @@ class Reference(NamedTuple):
     """Hold the reference in the world: `path` of the rig (None if there is no bag), `tags` and `cameras` by name."""
 
     path: Trajectory | None
-    tags: dict[Id, Array]
+    tags: LandmarkPlaces
     cameras: dict[str, Array]
 
 
@@ -255,7 +256,7 @@ def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
                 last[one.header.frame_id, one.child_frame_id] = pose
     if world != "map":
         track = [(t_ns, frame_between(pose, last["map", rig])) for t_ns, pose in track]
-    tags: dict[Id, Array] = {
+    tags: LandmarkPlaces = {
         int(child.removeprefix("tag_")): pose if parent == world else compose(last["map", parent], pose)[0]
         for (parent, child), pose in last.items()
         if child.startswith("tag_") and (parent == world or (world == "map" and ("map", parent) in last))
@@ -280,7 +281,7 @@ class Odometry(NamedTuple):
     sigma_rad: float
 
 
-def read_odometry(scene: Scene, received: list[tuple[str, Any]]) -> Odometry | None:
+def read_odometry(scene: Scene, received: Messages) -> Odometry | None:
     """Return the odometry of the rig, None if there is none in the bag."""
     for body in scene.odometry.values():
         rows = [(header_time(m), m.pose.pose) for topic, m in received if topic == body["odom_topic"]]
@@ -308,9 +309,7 @@ def rig_increments(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
 
 
 # ------------------------------------------------------------------ the log
-def scans_of(
-    received: list[tuple[str, Any]], cameras: dict[str, str], scene: Scene, bag: Path, request: Request
-) -> list[Scan]:
+def scans_of(received: Messages, cameras: dict[str, str], scene: Scene, bag: Path, request: Request) -> list[Scan]:
     """Return the scans of the cameras, by topic, in order of time: corners in TagSLAM's order and the size of each tag.
 
     What is left out is counted by its reason.
@@ -382,7 +381,7 @@ def read(
                      name=path.name, truth=truth, landmarks=reference.tags, describes=rig)  # fmt: skip
 
 
-def rig_body(path: Path, cameras: dict[str, dict[str, Any]]) -> str:
+def rig_body(path: Path, cameras: dict[str, Section]) -> str:
     """Return the one body that carries the cameras."""
     bodies = sorted({str(camera["rig_body"]) for camera in cameras.values()})
     if len(bodies) != 1:
@@ -407,12 +406,10 @@ def begin(path: Path, scans: list[Scan], reference: Reference, moved: Odometry |
     return kept
 
 
-def robot(
-    sections: dict[str, dict[str, Any]], reference: Reference, scans: list[Scan], moved: Odometry | None
-) -> dict[str, Any]:
+def robot(sections: dict[str, Section], reference: Reference, scans: list[Scan], moved: Odometry | None) -> Section:
     """Return the section of the rig, which starts where the reference has it."""
     pose = None if reference.path is None else reference.path.at(scans[0].t_ns)
-    start: dict[str, Any] = describe_pose(pose) if pose is not None and np.isfinite(pose).all() else {}
+    start: Section = describe_pose(pose) if pose is not None and np.isfinite(pose).all() else {}
     if moved is not None:
         return {"motion": {"type": "odometry_3d"}, "sensors": sections} | ({"start": start} if start else {})
     return {"motion": dict(MOTION), "start": start | VELOCITY, "sensors": sections}

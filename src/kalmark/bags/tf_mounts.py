@@ -14,6 +14,7 @@ from kalmark.bags.tf_frames import Frames
 from kalmark.bags.topics import Carried, InertialTopic, Posed, Topic
 from kalmark.geometry import rotations
 from kalmark.geometry.named_poses import describe_pose, pose_of
+from kalmark.logs.log import SensorKey
 from kalmark.logs.source import Request
 
 LEVEL = math.cos(math.radians(5))  # a sensor tilted by less is taken as level
@@ -29,7 +30,7 @@ class Mounts:
     def __init__(self, asked: Asked, request: Request) -> None:
         self.asked, self.request = asked, request
         self.frames, self.of_sensor, self.base = Frames(), dict[str, str](), dict[str, str]()
-        self.mounts: dict[tuple[str, str], dict[str, float]] = {}
+        self.mounts: dict[SensorKey, dict[str, float]] = {}
         self.level: dict[str, tuple[Array, bool]] = {}
 
     def look_ahead(self) -> None:

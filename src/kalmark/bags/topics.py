@@ -15,7 +15,8 @@ from kalmark.declare import Number, Within, class_of, classes, declared, paramet
 from kalmark.errors import LogError, ModelError
 from kalmark.events import Id, is_number, short_text
 from kalmark.geometry.named_poses import POSES
-from kalmark.logs.source import landmark_id, nanoseconds_of_text, spelling_hint
+from kalmark.logs.log import Names
+from kalmark.logs.source import landmark_id, nanoseconds_of_text, one_of
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, INERTIAL, TWIST3
 
 SensorName = Annotated[str | None, "The sensor's name among those of the robot; if absent the topic's, / as _."]
@@ -25,8 +26,8 @@ SensorName = Annotated[str | None, "The sensor's name among those of the robot; 
 class Topic:
     """Options of all topics: robot, and time."""
 
-    needs: ClassVar[tuple[str, ...]] = ()
-    columns: ClassVar[tuple[str, ...]] = ()
+    needs: ClassVar[Names] = ()
+    columns: ClassVar[Names] = ()
     space: ClassVar[bool] = False
 
     robot: Annotated[str, "Robot that it belongs to."] = "robot"
@@ -49,7 +50,7 @@ class Topic:
 class Posed(Topic):
     """Poses of the robot: Odometry, PoseStamped, PoseWithCovarianceStamped, or a frame of tf."""
 
-    needs: ClassVar[tuple[str, ...]] = ("pose", "transforms")
+    needs: ClassVar[Names] = ("pose", "transforms")
 
     frame: Annotated[str | None, "tf: the frame in which the pose is, such as odom."] = None
     child_frame: Annotated[str | None, "tf: the frame whose pose it is, such as base_link."] = None
@@ -80,14 +81,14 @@ class Moved(Posed, Noisy):
 class Odometry2DTopic(Moved):
     """Increments of odometry in the plane: differences of successive poses."""
 
-    columns: ClassVar[tuple[str, ...]] = INCREMENT2
+    columns: ClassVar[Names] = INCREMENT2
 
 
 @register("topic", "odometry_3d")
 class Odometry3DTopic(Moved):
     """Increments of odometry in space: differences of successive poses."""
 
-    columns: ClassVar[tuple[str, ...]] = INCREMENT3
+    columns: ClassVar[Names] = INCREMENT3
     space: ClassVar[bool] = True
 
 
@@ -95,16 +96,16 @@ class Odometry3DTopic(Moved):
 class UnicycleTopic(Topic, Noisy):
     """Speed and turn rate, held until the next message: Odometry, Twist, TwistStamped, TwistWithCovarianceStamped."""
 
-    needs: ClassVar[tuple[str, ...]] = ("twist",)
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "w_radps")
+    needs: ClassVar[Names] = ("twist",)
+    columns: ClassVar[Names] = ("v_mps", "w_radps")
 
 
 @register("topic", "velocity_3d")
 class Velocity3DTopic(Topic, Noisy):
     """Velocities in space, held until the next message: Odometry, Twist, TwistStamped, TwistWithCovarianceStamped."""
 
-    needs: ClassVar[tuple[str, ...]] = ("twist",)
-    columns: ClassVar[tuple[str, ...]] = TWIST3
+    needs: ClassVar[Names] = ("twist",)
+    columns: ClassVar[Names] = TWIST3
     space: ClassVar[bool] = True
 
 
@@ -112,16 +113,16 @@ class Velocity3DTopic(Topic, Noisy):
 class AckermannTopic(Topic):
     """Speed and steering angle, held until the next message: AckermannDrive, AckermannDriveStamped."""
 
-    needs: ClassVar[tuple[str, ...]] = ("drive",)
-    columns: ClassVar[tuple[str, ...]] = ("v_mps", "steering_rad")
+    needs: ClassVar[Names] = ("drive",)
+    columns: ClassVar[Names] = ("v_mps", "steering_rad")
 
 
 @register("topic", "inertial")
 class InertialTopic(Topic):
     """Rates and specific forces of an Imu, held until the next one: controls of a robot whose frame is the Imu's."""
 
-    needs: ClassVar[tuple[str, ...]] = ("force",)
-    columns: ClassVar[tuple[str, ...]] = INERTIAL
+    needs: ClassVar[Names] = ("force",)
+    columns: ClassVar[Names] = INERTIAL
     space: ClassVar[bool] = True
 
 
@@ -144,20 +145,16 @@ class Carried(Topic):
             raise refuse(self, "mount", f"a mapping of numbers with keys among {', '.join(POSES['space'])}")
         return None if given is None else dict(given)
 
-    def sensors(self, topic: str) -> tuple[str, ...]:
+    def sensors(self, topic: str) -> Names:
         """Return the names of the sensors that a topic of this name has readings of."""
         return (getattr(self, "sensor", None) or topic.strip("/").replace("/", "_"),)
-
-
-def _microseconds(time: Any) -> int:
-    return (nanoseconds_of_text(str(time)) + 500) // 1000
 
 
 @register("topic", "scan")
 class Scans(Carried):
     """Observations of a sensor: laser beams, points, ranges, detections, corners or poses of tags, markers."""
 
-    needs: ClassVar[tuple[str, ...]] = ("seen",)
+    needs: ClassVar[Names] = ("seen",)
 
     sensor: SensorName = None
     take: Annotated[
@@ -197,7 +194,10 @@ class Scans(Carried):
         """The ids of `ignore`, with the times (us) at which they are left out, None: at all times."""
         given = self.ignore or {}
         if isinstance(given, Mapping):
-            return {landmark_id(str(id_)): frozenset(map(_microseconds, times)) for id_, times in given.items()}
+            return {
+                landmark_id(str(id_)): frozenset((nanoseconds_of_text(str(time)) + 500) // 1000 for time in times)
+                for id_, times in given.items()
+            }
         if isinstance(given, str):
             raise TypeError(given)
         return dict.fromkeys(landmark_id(str(id_)) for id_ in given)
@@ -219,7 +219,7 @@ class Scans(Carried):
 class Images(Carried):
     """Images of a camera: Image, CompressedImage; its calibration is that of the CameraInfo beside it."""
 
-    needs: ClassVar[tuple[str, ...]] = ("image",)
+    needs: ClassVar[Names] = ("image",)
 
     sensor: SensorName = None
     info: Annotated[
@@ -240,7 +240,7 @@ class Sparse(Carried):
 class Imu(Sparse):
     """Readings of sensors of the robot itself by an Imu: of a gyroscope, and those that are given a name."""
 
-    needs: ClassVar[tuple[str, ...]] = ("rates",)
+    needs: ClassVar[Names] = ("rates",)
 
     gyro: Annotated[str | None, "Name of the sensor, a `gyro`, of its rates; null: they are not taken."] = "gyro"
     heading: Annotated[str | None, "Name of the sensor, a `heading`, of its orientation."] = None
@@ -255,7 +255,7 @@ class Imu(Sparse):
         if not self.sensors(""):
             raise refuse(self, "gyro", "a name, or one of heading, inclination, gravity")
 
-    def sensors(self, topic: str) -> tuple[str, ...]:
+    def sensors(self, topic: str) -> Names:
         """Return the names of the sensors that this topic has readings of."""
         return tuple(filter(None, (self.gyro, self.heading, self.inclination, self.gravity)))
 
@@ -264,7 +264,7 @@ class Imu(Sparse):
 class Compass(Sparse):
     """Headings by a MagneticField, of a robot of the plane: `heading`, counted from magnetic east to the left."""
 
-    needs: ClassVar[tuple[str, ...]] = ("field",)
+    needs: ClassVar[Names] = ("field",)
 
     sensor: SensorName = None
 
@@ -273,7 +273,7 @@ class Compass(Sparse):
 class Placed(Posed):
     """Poses, or positions on the globe, whose origin is that of metres."""
 
-    needs: ClassVar[tuple[str, ...]] = ("pose", "globe", "transforms")
+    needs: ClassVar[Names] = ("pose", "globe", "transforms")
 
     origin: Annotated[
         Any, "NavSatFix: [latitude_deg, longitude_deg, height_m] of the map's origin; the first fix if absent."
@@ -317,15 +317,12 @@ def topic_of(name: str, section: Any) -> Topic:
     if not isinstance(section, Mapping) or not isinstance(section.get("type"), str):
         raise LogError(f"{where} is {short_text(section)}, expected a mapping with a type: {', '.join(kinds)}")
     if section["type"] not in kinds:
-        hint = spelling_hint(section["type"], kinds)
-        raise LogError(f"{where}: type is {section['type']!r}, expected one of {', '.join(kinds)}{hint}")
+        raise LogError(f"{where}: type is {section['type']!r}, {one_of(kinds, section['type'])}")
     model = class_of("topic", section["type"])
     given, known = {key: value for key, value in section.items() if key != "type"}, [p.name for p in parameters(model)]
     for key in given:
         if key not in known:
-            raise LogError(
-                f"{where}: unknown key {key!r}, expected one of {', '.join(known)}{spelling_hint(str(key), known)}"
-            )
+            raise LogError(f"{where}: unknown key {key!r}, {one_of(known, key)}")
     try:
         topic: Topic = model(**given)
         if isinstance(topic, Carried):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.mcap_writer import Outgoing, header_fields, time_fields
+from kalmark.bags.mcap_writer import MessageFields, Outgoing, header_fields, time_fields
 from kalmark.events import Control, Fix
 from kalmark.geometry.rotations import from_matrix
 from kalmark.logs.log import Log, poses_of_size
@@ -30,7 +30,7 @@ def topic(robot: str, *names: str) -> str:
     return "/" + "/".join("".join(c if c.isalnum() and c.isascii() else "_" for c in name) for name in (robot, *names))
 
 
-def pose_fields(pose: Array) -> dict[str, Any]:
+def pose_fields(pose: Array) -> MessageFields:
     """Return the fields of a geometry_msgs/Pose, of a pose (3,) or (7,)."""
     x, y, z, *q = poses_of_size(pose[None], 7)[0].tolist()
     return {"position": {"x": x, "y": y, "z": z}, "orientation": dict(zip("xyzw", q, strict=True))}
@@ -44,7 +44,7 @@ def covariance_fields(cov: Array) -> Array:
     return out.ravel()
 
 
-def path_fields(t_ns: Sequence[int], poses: Array) -> dict[str, Any]:
+def path_fields(t_ns: Sequence[int], poses: Array) -> MessageFields:
     """Return the fields of a nav_msgs/Path, thinned where it has very many poses."""
     chosen = np.unique(np.linspace(0, len(t_ns) - 1, min(len(t_ns), MOST_POSES)).astype(int)) if len(t_ns) else ()
     rows = [{"header": header_fields(int(t_ns[k]), MAP), "pose": pose_fields(poses[k])} for k in chosen]
@@ -60,7 +60,7 @@ def marker(
     scale: Any,
     colour: Sequence[float],
     text: str = "",
-) -> dict[str, Any]:
+) -> MessageFields:
     """Return the fields of a visualization_msgs/Marker in the map's frame."""
     return {
         "header": header_fields(t_ns, MAP), "ns": space, "id": number, "type": kind, "pose": at, "text": text,
@@ -68,7 +68,7 @@ def marker(
     }  # fmt: skip
 
 
-def ellipsoid(mean: Array, cov: Array, sigmas: float = SIGMAS) -> tuple[dict[str, Any], Array] | None:
+def ellipsoid(mean: Array, cov: Array, sigmas: float = SIGMAS) -> tuple[MessageFields, Array] | None:
     """Return pose and axes (3,) (m) of the ellipse or ellipsoid of a Gaussian; None if it has no bounds."""
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
         return None
@@ -83,7 +83,7 @@ def ellipsoid(mean: Array, cov: Array, sigmas: float = SIGMAS) -> tuple[dict[str
     return pose_fields(at), scale
 
 
-def label(t_ns: int, number: int, text: str, at: Array, colour: Sequence[float]) -> dict[str, Any]:
+def label(t_ns: int, number: int, text: str, at: Array, colour: Sequence[float]) -> MessageFields:
     """Return a landmark's name, above it."""
     above = pose_of_place(at)
     above[2] += LABEL_M
@@ -97,7 +97,7 @@ def pose_of_place(place: Array) -> Array:
     return np.append(np.pad(place[:3], (0, 3 - len(place[:3]))), [0.0, 0, 0, 1])
 
 
-def marker_array(t_ns: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def marker_array(t_ns: int, rows: list[MessageFields]) -> MessageFields:
     """Return the fields of a MarkerArray that replaces all markers of its topic."""
     clear = {"header": header_fields(t_ns, MAP), "action": DELETE_ALL, "pose": {"orientation": {"w": 1.0}}}
     return {"markers": [clear, *rows]}
@@ -133,7 +133,7 @@ def view_messages(log: Log) -> Iterator[Outgoing]:
             yield Outgoing(topic(event.robot, "velocity"), "geometry_msgs/msg/TwistStamped", event.t_ns, fields)
 
 
-def transform_fields(t_ns: int, parent: str, child: str, pose: Array) -> dict[str, Any]:
+def transform_fields(t_ns: int, parent: str, child: str, pose: Array) -> MessageFields:
     """Return the fields of a geometry_msgs/TransformStamped."""
     at = pose_fields(pose)
     moved = {"translation": at["position"], "rotation": at["orientation"]}

@@ -158,11 +158,9 @@ def draw(path: Path, title: str, t_s: Array, panels: Sequence[tuple[str, float, 
 
     A panel is a quantity: its label, its ANEES for a consistent filter, and the ANEES of each estimator.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 2.5 * len(panels)), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axis, panel in zip(axes, panels, strict=True):
         _draw_panel(axis, t_s, *panel)

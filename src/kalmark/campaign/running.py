@@ -26,7 +26,7 @@ from kalmark.campaign.scoring import Scores, score
 from kalmark.campaign.sweep import Sweep
 from kalmark.campaign.sweep_cells import Cell, Scene, open_scene, parse_estimator, refuse_unknown
 from kalmark.config.building import build_slam
-from kalmark.config.reading import did_you_mean, validate
+from kalmark.config.reading import one_near, validate
 from kalmark.config.schema import Config
 from kalmark.config.tree import Tree, parse_value
 from kalmark.errors import ConfigError, KalmarkError
@@ -330,8 +330,7 @@ def worker_died(error: BaseException | None) -> bool:
 def check_backend(backend: str, address: str | None) -> None:
     """Refuse a backend that there is not, and an address for one that takes none."""
     if backend not in BACKENDS:
-        expected = f"expected one of {', '.join(BACKENDS)}{did_you_mean(backend, BACKENDS)}"
-        raise KalmarkError(f"campaign: backend is {backend!r}, {expected}")
+        raise KalmarkError(f"campaign: backend is {backend!r}, {one_near(BACKENDS, backend)}")
     if address is not None and backend == "loky":
         raise KalmarkError(f"campaign: address is {address!r}, expected none with loky, or backend dask or ray")
 

@@ -21,7 +21,7 @@ from kalmark.campaign.sweep_cells import Cell, value_as_yaml
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.figure_texts import Figures
-from kalmark.results.report import figure_text, html_table, read_page, spans
+from kalmark.results.report import figure_text, html_table, read_page, tagged
 from kalmark.results.scene import COLOURS
 
 _PANELS = (
@@ -132,12 +132,12 @@ class Sweep:
             of_cell = folder / f"cells/{i + 1:03d}" if self.keys else folder
             of_cell.mkdir(parents=True, exist_ok=True)
             campaign.write(of_cell)
-        pictures = [folder / "sweep.png" if self.keys else folder / "anees.png"]
+        picture = folder / ("sweep.png" if self.keys else "anees.png")
         if self.keys:
             write(folder / "summary.json", json.dumps(self.summary(), indent=2) + "\n")
-            self.draw(pictures[0])
+            self.draw(picture)
         self.write_runs(folder / "runs.parquet")
-        write(folder / "report.html", self.page(pictures[0]))
+        write(folder / "report.html", self.page(picture))
 
     def write_runs(self, path: Path) -> None:
         """Write the rows of `runs` to a Parquet file; a swept key whose values are of several kinds as text."""
@@ -158,7 +158,6 @@ class Sweep:
 
         The key is the last one of numbers, else the last one.  Bars are 95 % intervals over the runs.
         """
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
         rows = self.runs()
@@ -173,7 +172,6 @@ class Sweep:
             curves.setdefault(", ".join(others + ([] if same else [row["estimator"]])), []).append(row)
         panels = [(key, label) for key, label in _PANELS if any(np.isfinite(row[key]) for row in rows)]
         figure = Figure(figsize=(9, 2.3 * len(panels) + 0.8), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (key, label) in zip(axes, panels, strict=True):
             for i, (name, mine) in enumerate(curves.items()):
@@ -208,7 +206,7 @@ class Sweep:
         return read_page("campaign.html").format(
             title=html.escape(title),
             style=read_page("report.css"),
-            figures=spans(told),
+            figures=tagged("span", told),
             table=html_table([[figure_text(cell) for cell in row] for row in rows], head),
             picture=base64.b64encode(picture.read_bytes()).decode("ascii"),
             config=html.escape(first.description),

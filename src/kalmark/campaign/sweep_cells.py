@@ -11,7 +11,7 @@ from typing import Any
 
 from kalmark.campaign.replay import Replay, replay_of
 from kalmark.config.opening import open_run
-from kalmark.config.reading import did_you_mean, resolve_config, resolve_name, shipped_configs
+from kalmark.config.reading import one_near, resolve_config, resolve_name, shipped_configs
 from kalmark.config.schema import Config
 from kalmark.config.sections import Choice
 from kalmark.config.tree import OVERRIDE, parse_value, read_tree
@@ -118,8 +118,7 @@ def refuse_unknown(estimators: Sequence[str] | None) -> None:
     for i, label in enumerate(estimators or ()):
         name, _ = parse_estimator(label)
         if not known.has(name):
-            expected = f"expected one of {', '.join(known.names())}{did_you_mean(name, known.names())}"
-            raise ConfigError(f"campaign: estimator is {label!r}, {expected}")
+            raise ConfigError(f"campaign: estimator is {label!r}, {one_near(known.names(), name)}")
         if label in (estimators or ())[:i]:
             raise ConfigError(f"campaign: estimator {label!r} is given twice, expected each once")
 

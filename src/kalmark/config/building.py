@@ -12,10 +12,10 @@ from pydantic import BaseModel
 
 from kalmark.arrays import Array
 from kalmark.config.opening import known_map_path, open_run, with_log_description
-from kalmark.config.reading import did_you_mean, load_config, validate
+from kalmark.config.reading import did_you_mean, load_config, one_near, validate
 from kalmark.config.schema import TRUTH, Config, SpaceStartConfig
 from kalmark.config.sections import ModelSection, model_of
-from kalmark.config.tree import EACH, Tree, quote_value
+from kalmark.config.tree import EACH, KeyPath, Tree, quote_value
 from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
@@ -80,14 +80,11 @@ def _known(config: Config, log: Log | None) -> list[KnownLandmark]:
         if log is None or not log.landmarks:
             raise config.error(("map", "known"), "got truth, expected a log that has true landmarks")
         return [KnownLandmark(name, place) for name, place in log.landmarks.items()]
-    try:
-        path = known_map_path(config)
-        readers = {ending: read for entry in known_formats().values() for ending, read in entry.known_maps.items()}
-        if path.suffix in readers:
-            return readers[path.suffix](path, exact)
-        return read_known(path, exact, None if log is None else log.origin)
-    except LogError as error:
-        raise config.error(("map", "known"), str(error)) from None
+    path = _made(config, ("map", "known"), known_map_path, config)
+    readers = {ending: read for entry in known_formats().values() for ending, read in entry.known_maps.items()}
+    if path.suffix in readers:
+        return _made(config, ("map", "known"), readers[path.suffix], path, exact)
+    return _made(config, ("map", "known"), read_known, path, exact, None if log is None else log.origin)
 
 
 def slam_from_config(path_or_name: str | Path) -> Slam:
@@ -181,13 +178,13 @@ def _names(config: Config, log: Log | None) -> list[str]:
         return named or ["robot"]
     for name in named if config.log.robots is None else ():
         if name not in log.robots:
-            what = f"got a robot that the log does not have, expected one of {', '.join(log.robots)}"
-            raise config.error(("robots", name), what + did_you_mean(name, log.robots))
+            what = "got a robot that the log does not have"
+            raise config.error(("robots", name), f"{what}, {one_near(log.robots, name)}")
     return list(log.robots)
 
 
 def _start(
-    config: Config, path: tuple[str, ...], section: Any, name: str, log: Log | None, moves: MotionModel
+    config: Config, path: KeyPath, section: Any, name: str, log: Log | None, moves: MotionModel
 ) -> tuple[Any, Any]:
     """Return the start and its covariance: as configured, else by the truth, else the origin."""
     if section is not None:
@@ -196,7 +193,7 @@ def _start(
 
 
 def _placed(
-    config: Config, path: tuple[str, ...], section: Any, dof: int, behind: tuple[str, ...] = ()
+    config: Config, path: KeyPath, section: Any, dof: int, behind: KeyPath = ()
 ) -> tuple[list[float], Array | None]:
     """Return where a section places a mount or a start, with its state, and the covariance.
 
@@ -236,7 +233,7 @@ def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov
     return found.start, found.cov, int(t_ns[0]) + round(found.until_s * 1e9)
 
 
-def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mount:
+def _mount(config: Config, path: KeyPath, sensor: Any, world: str) -> Mount:
     own = {each.name: getattr(sensor, each.name) for each in fields(Mount) if each.name not in OF_PLACE}
     if sensor.initialization.type == "immediate":
         del own["initialization"]
@@ -249,20 +246,20 @@ def _mount(config: Config, path: tuple[str, ...], sensor: Any, world: str) -> Mo
     return _made(config, path, Mount, model, at=at, cov=cov, **parts)
 
 
-def _part(config: Config, path: tuple[str, ...], value: Any, world: str) -> Any:
+def _part(config: Config, path: KeyPath, value: Any, world: str) -> Any:
     """Return the model that a section describes, or a value that is none."""
     return _made(config, path, model_of, value, world) if isinstance(value, ModelSection) else value
 
 
-def _made(config: Config, path: tuple[str, ...], make: Callable[..., Any], *args: Any, **keys: Any) -> Any:
+def _made(config: Config, path: KeyPath, make: Callable[..., Any], *args: Any, **keys: Any) -> Any:
     """Return what `make` makes of these; errors name the place of the section at `path`."""
     try:
         return make(*args, **keys)
-    except ModelError as error:
+    except (ModelError, LogError) as error:
         raise config.error(path, str(error)) from None
 
 
-def refuse_controls(config: Config, key: str, name: str, columns: tuple[str, ...], log: Log) -> None:
+def refuse_controls(config: Config, key: str, name: str, columns: KeyPath, log: Log) -> None:
     """Refuse controls that the motion of a robot does not take."""
     given = tuple(log.control_columns.get(name, columns))
     if given != columns:
@@ -320,8 +317,8 @@ def refuse_uncalibrated(config: Config, key: str, name: str, log: Log) -> None:
 
 
 def _other_columns(
-    log: Log, robot: str, sensor: str, given: tuple[str, ...], wanted: str, fitting: list[Any], key: str,
-    columns: tuple[str, ...],
+    log: Log, robot: str, sensor: str, given: KeyPath, wanted: str, fitting: list[Any], key: str,
+    columns: KeyPath,
 ) -> LogError:  # fmt: skip
     """Return the error of columns other than those wanted, with a type that has them or the column that was meant."""
     missing = [name for name in columns if name not in given]
@@ -332,6 +329,6 @@ def _other_columns(
     return log.other_columns(robot, sensor, given, wanted + hint)
 
 
-def _fitting(role: str, columns: tuple[str, ...]) -> list[str | None]:
+def _fitting(role: str, columns: KeyPath) -> list[str | None]:
     """Return the types of kalmark's own models that take these columns."""
     return [registered_name(model) for model in built_in(role) if model.columns == columns]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.config.tree import Tree, folder_beside, quote_value
+from kalmark.config.tree import KeyPath, Tree, folder_beside, quote_value
 from kalmark.declare import class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import is_number, largest_magnitude
@@ -76,7 +76,7 @@ def take_data_sheets(tree: Tree, path: Path | None) -> None:
             _take(tree, path, ("robots", name, "sensors", sensor), section)
 
 
-def _take_preset(tree: Tree, where: tuple[str, ...], section: Any) -> None:
+def _take_preset(tree: Tree, where: KeyPath, section: Any) -> None:
     """Put the numbers of the device that a motion names as its `preset` in its place."""
     if not isinstance(section, dict) or "preset" not in section or not _has_one(KEY, section.get("type")):
         return
@@ -91,7 +91,7 @@ def _take_preset(tree: Tree, where: tuple[str, ...], section: Any) -> None:
     section |= {name: getattr(unit, name) for name in MOTIONS[given].sources if name in names} | section
 
 
-def _take(tree: Tree, path: Path | None, where: tuple[str, ...], section: Any) -> None:
+def _take(tree: Tree, path: Path | None, where: KeyPath, section: Any) -> None:
     """Replace the file of a motion or a sensor by its values."""
     key = KEY if where[-1] == "motion" and len(where) == 3 else CALIBRATION
     if not isinstance(section, dict) or key not in section or not _has_one(key, section.get("type")):

@@ -130,7 +130,7 @@ def _choice(title: str, role: str, world: str = "") -> str:
 def _table(model: type[BaseModel], common: type[BaseModel] = Section) -> str:
     said = {name: field.description for name, field in model.model_fields.items()} | _texts(model)
     rows = [
-        f"| `{name}` | {_default(field)} | {unit_of(name)} | {said[name]} |"
+        f"| `{name}` | {_value(field.get_default(call_default_factory=True))} | {unit_of(name)} | {said[name]} |"
         for name, field in model.model_fields.items()
         if said[name] and name not in common.model_fields
     ]
@@ -147,10 +147,6 @@ def _texts(section: type) -> dict[str, str]:
             if isinstance(key, ast.AnnAssign) and isinstance(text, ast.Expr):
                 texts[key.target.id] = inspect.cleandoc(text.value.value)  # type: ignore[attr-defined, union-attr]
     return texts
-
-
-def _default(field: Any) -> str:
-    return _value(field.get_default(call_default_factory=True))
 
 
 def _value(value: Any) -> str:

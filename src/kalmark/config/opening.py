@@ -7,9 +7,9 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from kalmark.config.reading import ENDINGS, config_of, did_you_mean, resolve_config, shipped_configs
+from kalmark.config.reading import ENDINGS, config_of, one_near, resolve_config, shipped_configs
 from kalmark.config.schema import TRUTH, Config, LogConfig
-from kalmark.config.tree import EACH, OVERRIDE, Tree, merge_trees, read_tree, tree_of, with_each
+from kalmark.config.tree import EACH, OVERRIDE, KeyPath, Plain, Tree, merge_trees, read_tree, tree_of, with_each
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import Raw, Scan
 from kalmark.logs import find_data, known_formats, open_log
@@ -106,7 +106,7 @@ def effective_config(config: Config, log_path: str | Path | None = None) -> Conf
     >>> effective_config(load_config("native"), "my_log").log.path.endswith("my_log")
     True
     """
-    named: dict[str, Any] = {name: resolve_path(config, getattr(config.log, name)) for name in ("truth", "fixes")}
+    named: Plain = {name: resolve_path(config, getattr(config.log, name)) for name in ("truth", "fixes")}
     log = config.log.model_copy(update=named | resolve_options(config) | {"path": str(find_log(config, log_path))})
     return config.model_copy(update={"log": log})
 
@@ -130,7 +130,7 @@ def open_config_log(config: Config, log_path: str | Path | None = None, *, progr
     return found
 
 
-def resolve_options(config: Config) -> dict[str, Any]:
+def resolve_options(config: Config) -> Plain:
     """Return the options of a configuration's log, with the files found that they name.  Raises LogError."""
     options = config.log.options()
     for option in (option for entry in known_formats().values() for option in entry.options.values()):
@@ -178,8 +178,7 @@ def check_format(config: Config, path: Path) -> None:
     """Refuse a format that does not exist and options that the log's format does not have."""
     name = config.log.format
     if name is not None and name not in known_formats():
-        message = f"got {name!r}, expected one of {', '.join(known_formats())}{did_you_mean(name, [*known_formats()])}"
-        raise config.error(("log", "format"), message)
+        raise config.error(("log", "format"), f"got {name!r}, {one_near([*known_formats()], name)}")
     entry, _ = recognise(path, name)
     for key, value in config.log.options().items():
         if key not in entry.options:
@@ -221,7 +220,7 @@ def resolve_each(tree: Tree, log: Log) -> None:
             del node[EACH]
 
 
-def _place(tree: Tree, values: dict[str, Any], path: tuple[str, ...], log: str) -> None:
+def _place(tree: Tree, values: Plain, path: KeyPath, log: str) -> None:
     """Note that what was not written by the user comes from the log."""
     for key, value in values.items():
         here = (*path, key)
@@ -237,8 +236,5 @@ def refuse_idle(tree: Tree, log: Log) -> None:
     for path, place in tree.places.items() if isinstance(named, dict) else ():
         if path[:1] != ("robots",) or len(path) < 2 or path[1] in (*log.robots, EACH) or not place.startswith(OVERRIDE):
             continue
-        near = did_you_mean(path[1], log.robots)
-        raise ConfigError(
-            f"{place}: robots.{path[1]}: got a robot that is not in this log or run, expected one of "
-            f"{', '.join(log.robots)}{near}"
-        )
+        what = "got a robot that is not in this log or run"
+        raise ConfigError(f"{place}: robots.{path[1]}: {what}, {one_near(log.robots, path[1])}")

@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from kalmark.config.data_sheets import take_data_sheets
 from kalmark.config.schema import Config
-from kalmark.config.tree import Tree, folder_beside, quote_value, read_tree
+from kalmark.config.tree import KeyPath, Tree, folder_beside, quote_value, read_tree
 from kalmark.declare import classes, load_plugin
 from kalmark.errors import ConfigError, KalmarkError
 
@@ -133,7 +133,12 @@ def did_you_mean(word: str, words: Sequence[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> ConfigError:
+def one_near(words: Sequence[str], word: str) -> str:
+    """Return that one of these words is expected, and the nearest one."""
+    return f"expected one of {', '.join(words)}{did_you_mean(word, words)}"
+
+
+def _one_error(path: KeyPath, error: ErrorDetails, tree: Tree) -> ConfigError:
     context: dict[str, Any] = error.get("ctx", {})
     kind = error["type"]
     if kind == "unknown_key":
@@ -160,9 +165,9 @@ def _one_error(path: tuple[str, ...], error: ErrorDetails, tree: Tree) -> Config
     return ConfigError(f"{tree.place(path)}: {'.'.join(path)}: {message}")
 
 
-def _path(loc: tuple[int | str, ...], values: Any) -> tuple[str, ...]:
+def _path(loc: tuple[int | str, ...], values: Any) -> KeyPath:
     """Return the path of keys that an error's location means, without the types of the choices taken on the way."""
-    path: tuple[str, ...] = ()
+    path: KeyPath = ()
     node = values
     for part in loc:
         here = part in node and part != node.get("type") if isinstance(node, dict) else False
@@ -172,7 +177,7 @@ def _path(loc: tuple[int | str, ...], values: Any) -> tuple[str, ...]:
     return path
 
 
-def _at(values: Any, path: tuple[str, ...]) -> Any:
+def _at(values: Any, path: KeyPath) -> Any:
     for part in path:
         if isinstance(values, dict):
             values = values.get(part)
@@ -190,7 +195,7 @@ def _expected(kind: str, context: dict[str, Any], message: str) -> str:
     return _EXPECTED.get(kind, message[0].lower() + message[1:])
 
 
-def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
+def _not_one_of(got: Any, words: Sequence[str], path: KeyPath) -> str:
     kind = _kind(path[:-1])
     for here, there, world in (("space", "the plane", "plane"), ("the plane", "space", "space")):
         if kind == "sensor" and path[-1] == "type" and str(got) in classes("sensor", world):
@@ -198,7 +203,7 @@ def _not_one_of(got: Any, words: Sequence[str], path: tuple[str, ...]) -> str:
     return f"got {quote_value(got)}, expected {_one_of(words)}{did_you_mean(str(got), words)}"
 
 
-def _kind(path: tuple[str, ...]) -> str:
+def _kind(path: KeyPath) -> str:
     """Return what is chosen at `path`: motion, sensor, landmark, association, estimator or map."""
     if len(path) > 1 and path[-2] == "sensors":
         return "sensor"

@@ -26,7 +26,7 @@ from kalmark.config.sections import (
     unexpected_value,
     unknown_key,
 )
-from kalmark.config.tree import OVERRIDE, name_of, place_around
+from kalmark.config.tree import OVERRIDE, KeyPath, name_of, place_around
 from kalmark.declare import classes, register, registered_name
 from kalmark.errors import ConfigError
 from kalmark.events import LONGEST_PAUSE_S
@@ -47,7 +47,7 @@ Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
 Classes = Annotated[Any, Choice("classes", typed=False)]
 Picture = Annotated[Any, Choice("picture", typed=False)]
 
-Plugins = Annotated[tuple[str, ...], Field(strict=False)]
+Plugins = Annotated[KeyPath, Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
 
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
@@ -475,13 +475,13 @@ class Config(OfFile):
     longest_pause_s: Positive = LONGEST_PAUSE_S
     """An event that comes later after the one before it has a wrong stamp and is refused; 10 such in a row are not."""
 
-    _where: dict[tuple[str, ...], str] = PrivateAttr(default_factory=dict)
+    _where: dict[KeyPath, str] = PrivateAttr(default_factory=dict)
 
     def overridden(self, *path: str) -> bool:
         """Return whether an override gave the value at `path`."""
         return place_around(self._where, path).startswith(OVERRIDE)
 
-    def error(self, path: tuple[str, ...], message: str) -> ConfigError:
+    def error(self, path: KeyPath, message: str) -> ConfigError:
         """Return the error of the value at `path`, naming the place it was read from."""
         where = place_around(self._where, path)
         return ConfigError(f"{where + ': ' if where else ''}{'.'.join(path)}: {message}")

@@ -23,11 +23,11 @@ from kalmark.errors import ConfigError
 from kalmark.events import short_text
 from kalmark.files import refuse_aliases
 
+Plain = dict[str, Any]  # the values of a mapping in YAML
+KeyPath = tuple[str, ...]  # keys, from the whole configuration to one of its values
 EACH = "each"
 SHARED = ("robots", "sensors")  # the mappings whose entry `each` stands for all
 OVERRIDE = "--set "  # how the place begins of what was set on the command line
-_MOST = 100_000  # aliases can repeat a few lines more often than memory holds
-_DEEPEST = 12  # a configuration is 5 levels deep; an alias to its own parent has no end
 
 
 def name_of(file: Path | None, general: str) -> str:
@@ -46,17 +46,17 @@ def name_on(name: str, log: str) -> str:
 class Tree:
     """Plain values, with the place of every key and every value by path."""
 
-    values: dict[str, Any] = field(default_factory=dict)
-    keys: dict[tuple[str, ...], str] = field(default_factory=dict)
-    places: dict[tuple[str, ...], str] = field(default_factory=dict)
+    values: Plain = field(default_factory=dict)
+    keys: dict[KeyPath, str] = field(default_factory=dict)
+    places: dict[KeyPath, str] = field(default_factory=dict)
 
-    def place(self, path: tuple[str, ...], *, of_key: bool = False) -> str:
+    def place(self, path: KeyPath, *, of_key: bool = False) -> str:
         """Return where the value (or its key) at `path` was written, or the nearest thing around it."""
         if of_key and path in self.keys:
             return self.keys[path]
         return place_around(self.places, path)
 
-    def share(self, node: dict[str, Any], path: tuple[str, ...], name: str) -> None:
+    def share(self, node: Plain, path: KeyPath, name: str) -> None:
         """Lay the entry `name` of the mapping `node`, at `path`, over its `each`, which then was written there, too."""
         each, own = deepcopy(node[EACH]), node.get(name)
         node[name] = each if own is None else merge_trees(each, own) if isinstance(own, dict) else own
@@ -65,7 +65,7 @@ class Tree:
                 table.setdefault((*path, name, *p[len(path) + 1 :]), table[p])
 
 
-def place_around(places: Mapping[tuple[str, ...], str], path: tuple[str, ...]) -> str:
+def place_around(places: Mapping[KeyPath, str], path: KeyPath) -> str:
     """Return the place of the value at `path`, or of the nearest thing around it, "" if none is known."""
     return next((places[path[:n]] for n in range(len(path), -1, -1) if path[:n] in places), "")
 
@@ -75,7 +75,7 @@ def folder_beside(path: Path | None, place: str) -> Path:
     return Path() if path is None or place.startswith(OVERRIDE) else path.resolve().parent
 
 
-def merge_trees(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def merge_trees(below: Plain, above: Plain) -> Plain:
     """Return `below` with `above` laid over it, key by key; another `type` replaces its section, but for a mount."""
     other = "type" in above and above["type"] != below.get("type", above["type"])
     result = {key: value for key, value in below.items() if not other or key == "mount"}
@@ -85,7 +85,7 @@ def merge_trees(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def with_each(values: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[dict[str, Any], tuple[str, ...]]]:
+def with_each(values: Any, path: KeyPath = ()) -> Iterator[tuple[Plain, KeyPath]]:
     """Yield the mappings of robots and of their sensors that have an `each`, robots first, with their paths."""
     for key in SHARED if isinstance(values, dict) else ():
         node = values.get(key)
@@ -107,7 +107,6 @@ def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     content = _parse(text, str(path))
-    refuse_aliases(content, str(path), ConfigError)
     if not isinstance(content, CommentedMap) or not content:
         got = "an empty file" if not content and not isinstance(content, int | float) else quote_value(content)
         raise ConfigError(f"{path}:1:1: got {got}, expected a mapping of keys")
@@ -122,7 +121,7 @@ def read_tree(path: Path, overrides: Sequence[str] = ()) -> Tree:
     return tree
 
 
-def tree_of(values: dict[str, Any], overrides: Sequence[str] = ()) -> Tree:
+def tree_of(values: Plain, overrides: Sequence[str] = ()) -> Tree:
     """Return plain values as a tree with the overrides applied.  Raises ConfigError."""
     tree = Tree(values)
     for override in overrides:
@@ -146,7 +145,7 @@ def parse_value(text: str, where: str) -> Any:
 
 def _parse(text: str, name: str) -> Any:
     try:
-        return YAML(typ="rt", pure=True).load(io.StringIO(text))
+        content = YAML(typ="rt", pure=True).load(io.StringIO(text))
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{name}:{mark.line + 1}:{mark.column + 1}" if mark else name
@@ -157,6 +156,8 @@ def _parse(text: str, name: str) -> Any:
         raise ConfigError(f"{name}:{line}:{column}: got {text[error.position]!r}, expected printable text") from None
     except Exception as error:  # of odd YAML the parser raises anything: unhashable keys, dates, integers, recursion
         raise ConfigError(f"{name}: {_one_line(error)}") from None
+    refuse_aliases(content, name, ConfigError)
+    return content
 
 
 def _one_line(error: Exception) -> str:
@@ -168,12 +169,8 @@ def _one_line(error: Exception) -> str:
     return f"{problem} ({context}), expected YAML" if context else f"{problem}, expected YAML"
 
 
-def _plain(node: Any, path: tuple[str, ...], tree: Tree, name: str) -> Any:
+def _plain(node: Any, path: KeyPath, tree: Tree, name: str) -> Any:
     """Return `node` as plain dict, list and scalars, noting where each stood."""
-    if len(path) > _DEEPEST:
-        raise ConfigError(f"{tree.place(path)}: {'.'.join(path[:4])}...: nested deeper than {_DEEPEST} levels")
-    if len(tree.places) > _MOST:
-        raise ConfigError(f"{name}: more than {_MOST} values, expected a configuration")
     if isinstance(node, CommentedMap):
         return {str(key): _item(node, key, path, tree, name) for key in node}
     if isinstance(node, CommentedSeq):
@@ -184,7 +181,7 @@ def _plain(node: Any, path: tuple[str, ...], tree: Tree, name: str) -> Any:
     return None if node is None else str(node)
 
 
-def _item(node: CommentedMap | CommentedSeq, key: Any, path: tuple[str, ...], tree: Tree, name: str) -> Any:
+def _item(node: CommentedMap | CommentedSeq, key: Any, path: KeyPath, tree: Tree, name: str) -> Any:
     place = (*path, str(key))
     if key in (node.lc.data or ()):
         line, column, *rest = node.lc.data[key]
@@ -207,7 +204,7 @@ def _override(tree: Tree, override: str) -> None:
     _set(tree, tree.values, path, 0, parse_value(text, where), where)
 
 
-def _set(tree: Tree, node: dict[str, Any], path: tuple[str, ...], depth: int, value: Any, where: str) -> None:
+def _set(tree: Tree, node: Plain, path: KeyPath, depth: int, value: Any, where: str) -> None:
     """Set the value at `path` below `node`, which is `depth` keys deep."""
     if depth == len(path) - 1:
         _replace(tree, node, path, value, where)
@@ -225,7 +222,7 @@ def _set(tree: Tree, node: dict[str, Any], path: tuple[str, ...], depth: int, va
         _set(tree, node[name], (*here, *path[depth + 1 :]), depth + 1, deepcopy(value), where)
 
 
-def _replace(tree: Tree, node: dict[str, Any], path: tuple[str, ...], value: Any, where: str) -> None:
+def _replace(tree: Tree, node: Plain, path: KeyPath, value: Any, where: str) -> None:
     if path[-1] == "type" and node.get("type", value) != value:  # another type has other keys; a mount stays
         for key in [key for key in node if key != "mount"]:
             del node[key]

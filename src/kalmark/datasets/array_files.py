@@ -11,7 +11,7 @@ from kalmark.arrays import Array
 from kalmark.datasets import matlab
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
-from kalmark.logs.log import Times
+from kalmark.logs.log import Names, Times
 from kalmark.logs.source import file_in
 
 
@@ -23,7 +23,7 @@ def variables(path: Path) -> set[str]:
         return set()
 
 
-def arrays(path: Path, names: tuple[str, ...]) -> dict[str, Array]:
+def arrays(path: Path, names: Names) -> dict[str, Array]:
     """Return variables of a MATLAB file as float arrays.  Raises LogError if one is missing or not finite."""
     if not path.is_file():
         raise LogError(f"{path}: no such file, expected a MATLAB file with {', '.join(names)}")
@@ -71,7 +71,7 @@ def events_of(
         yield Scan(t_ns=t, robot=robot, sensor=sensor, y=y, ids=ids)
 
 
-def find_variables(file: str, names: tuple[str, ...], path: Path) -> Path | None:
+def find_variables(file: str, names: Names, path: Path) -> Path | None:
     """Return the MATLAB file, given it or its folder, if it has all these variables."""
     path = file_in(path, file)
     return path if path.suffix == ".mat" and variables(path) >= set(names) else None

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.angles import wrap
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, Section
 from kalmark.logs.source import (
     STEP_NS,
     Format,
@@ -36,6 +35,7 @@ from kalmark.logs.source import (
     nanoseconds_of_text,
     number_of_text,
     one_robot,
+    reason_of,
     text_rows,
 )
 from kalmark.logs.table_columns import BEAM, INCREMENT2
@@ -135,18 +135,18 @@ def read(path: Path, request: Request) -> Log:
         try:
             reader.take(cells)
         except (ValueError, IndexError) as error:
-            what = "too few cells" if isinstance(error, IndexError) else " ".join(str(error).split())
+            what = "too few cells" if isinstance(error, IndexError) else reason_of(error)
             request.refuse(f"{path}:{line}: {cells[0]}: {what}, expected a message of CARMEN with finite numbers")
     if not reader.odometry:
         raise LogError(f"{path}: no message that can be used, expected {CARMEN.what}")
     for tag, count in sorted(reader.unread.items()):
         request.leave_out(count, f"{path}: {count} {tag} messages, which are not read")
     sensors = sorted({sensor for sensor, _ in reader.scans})
-    mounts: dict[str, Any] = {}
+    mounts: Section = {}
     for sensor in sensors:
         behind = {"theta_rad": math.pi} if sensor == "rear_laser" else {}
         mounts[sensor] = {"mount": {"x_m": reader.offsets.get(sensor, 0.0)} | behind}
-    told: dict[str, Any] = {"motion": {"type": "odometry_2d"}} | ({"sensors": mounts} if mounts else {})
+    told: Section = {"motion": {"type": "odometry_2d"}} | ({"sensors": mounts} if mounts else {})
     return one_robot(
         "carmen", path, request, ROBOT, reader.events(), INCREMENT2, dict.fromkeys(sensors, BEAM),
         name=path.stem, describes={"robots": {ROBOT: told}},

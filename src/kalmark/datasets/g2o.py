@@ -42,7 +42,8 @@ from kalmark.events import Control, Event, Id, Scan, short_text, unit_quaternion
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew
-from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.known_map import from_triangle
+from kalmark.logs.log import LandmarkPlaces, Log, Names, Section, Trajectory
 from kalmark.logs.source import (
     STEP_NS,
     Format,
@@ -50,6 +51,7 @@ from kalmark.logs.source import (
     landmark_id,
     number_of_text,
     one_robot,
+    reason_of,
     text_rows,
 )
 from kalmark.logs.table_columns import BEAM, INCREMENT2, INCREMENT3, POSITION
@@ -73,7 +75,7 @@ class Graph:
     """Content of a file: poses, places and edges, by ids."""
 
     poses: dict[int, Array] = field(default_factory=dict)
-    places: dict[Id, Array] = field(default_factory=dict)
+    places: LandmarkPlaces = field(default_factory=dict)
     moves: dict[tuple[int, int], tuple[Array, Array]] = field(default_factory=dict)
     sights: dict[tuple[str, int], list[tuple[Id, Array, Array]]] = field(default_factory=dict)
     offset: Array | None = None
@@ -84,9 +86,7 @@ def information(cells: list[str], size: int) -> Array:
     """Return the covariance (size, size) whose inverse has this upper triangle.  Raises ValueError."""
     if len(cells) != size * (size + 1) // 2:
         raise ValueError(f"{len(cells)} numbers of information, expected {size * (size + 1) // 2}")
-    H = np.zeros((size, size))
-    H[np.triu_indices(size)] = [number_of_text(cell) for cell in cells]
-    H = H + np.triu(H, 1).T
+    H = from_triangle([number_of_text(cell) for cell in cells])
     np.linalg.cholesky(H)  # its LinAlgError is a ValueError
     C = np.linalg.inv(H)
     return np.asarray((C + C.T) / 2)
@@ -194,7 +194,7 @@ def read(
         try:
             take(graph, tag, cells)
         except (ValueError, IndexError) as error:
-            request.refuse(f"{path}:{line}: {tag}: {' '.join(str(error).split())}, expected {WHAT}")
+            request.refuse(f"{path}:{line}: {tag}: {reason_of(error)}, expected {WHAT}")
     ids = sorted({*graph.poses, *(at for _, at in graph.sights), *(one for pair in graph.moves for one in pair)})
     for reason, count in sorted(graph.left_out.items()):
         request.leave_out(count, f"{path}: {count} {reason}")
@@ -227,7 +227,7 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
         y, cov = [y for y, _ in first.values()], [C for _, C in first.values()]
         scans.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=name, y=y, ids=[*first], cov=cov))
     steps, mount = INCREMENT3 if space else INCREMENT2, graph.offset
-    known: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    known: dict[str, tuple[Section, Names]] = {
         SENSOR: ({"type": "position_3d" if space else "position"}, POSITION[:d]),
         BEARINGS: ({"type": "bearing", "initialization": {"type": "delayed"}}, BEAM[1:]),
         LOOPS: ({"type": "odometer", "keep": 0}, steps),

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.logs.log import Names
 
 HEADER, TAG, EIGHT = 128, 8, 8
 ORDERS = {b"IM": "<", b"MI": ">"}
@@ -100,7 +101,7 @@ def names(path: Path) -> set[str]:
     return {head(content, order).name for order, content in elements(path, NAME_BYTES)}
 
 
-def load_arrays(path: Path, wanted: tuple[str, ...]) -> dict[str, Array]:
+def load_arrays(path: Path, wanted: Names) -> dict[str, Array]:
     """Return those of the wanted arrays that there are, as float64.  Raises ValueError, OSError."""
     out = {}
     for order, content in elements(path, MOST_BYTES):

@@ -12,8 +12,8 @@ from typing import Annotated
 from kalmark.declare import Number
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, short_text, sort_key
-from kalmark.logs.log import Log, Trajectory
-from kalmark.logs.source import Format, Request, read_points, spelling_hint, text_rows, timed_rows
+from kalmark.logs.log import Log, Names, Trajectory
+from kalmark.logs.source import Format, Request, one_of, read_points, text_rows, timed_rows
 from kalmark.logs.table_columns import BEAM
 
 SENSOR = "camera"
@@ -30,7 +30,7 @@ def find(path: Path) -> Path | None:
     return folder if robots_in(folder) else None
 
 
-def robots_in(folder: Path) -> tuple[str, ...]:
+def robots_in(folder: Path) -> Names:
     """Return the names of the robots that the folder has odometry or measurements of."""
     found = (_ROBOT_FILE.fullmatch(file.name) for file in folder.iterdir())
     numbers = {int(match[1]) for match in found if match and match[2] != "Groundtruth"}
@@ -51,9 +51,7 @@ def read(
     present = robots_in(path)
     for robot in request.robots or ():
         if robot not in present:
-            raise LogError(
-                f"{path}: no robot {robot!r}, expected one of {', '.join(present)}{spelling_hint(robot, present)}"
-            )
+            raise LogError(f"{path}: no robot {robot!r}, {one_of(present, robot)}")
     shift_ns = round(bearing_shift_s * 1e9)
     subjects = read_barcodes(path / "Barcodes.dat", request)
     ignored = () if robot_sightings else MRCLAM_ROBOTS

@@ -15,8 +15,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.datasets.array_files import arrays
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, short_text
-from kalmark.logs.log import Log, Trajectory
+from kalmark.events import Control, Event, Scan, short_text
+from kalmark.logs.log import LandmarkPlaces, Log, Trajectory
 from kalmark.logs.source import (
     Format,
     Refuse,
@@ -96,7 +96,7 @@ def ranges(path: Path, refuse: Refuse) -> Iterator[tuple[int, int, int, float]]:
             yield row
 
 
-def read_truth(path: Path) -> tuple[dict[str, Trajectory], dict[Id, Array]]:
+def read_truth(path: Path) -> tuple[dict[str, Trajectory], LandmarkPlaces]:
     """Return the true path of the robot and the surveyed beacons, nothing without the file."""
     if not path.is_file():
         return {}, {}
@@ -107,7 +107,7 @@ def read_truth(path: Path) -> tuple[dict[str, Trajectory], dict[Id, Array]]:
             "heading) and 3 (beacon, x, y)"
         )
     t_ns = np.rint(data["GT"][:, 0] * 1e9).astype(np.int64)
-    beacons: dict[Id, Array] = {int(row[0]): row[1:].copy() for row in data["TL"]}
+    beacons: LandmarkPlaces = {int(row[0]): row[1:].copy() for row in data["TL"]}
     return {ROBOT: Trajectory(t_ns, data["GT"][:, 1:])}, beacons
 
 

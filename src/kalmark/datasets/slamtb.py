@@ -23,7 +23,7 @@ from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.files import read_arrays, unpack_file
 from kalmark.geometry.gaussian import sigma_probability
 from kalmark.geometry.named_poses import describe_pose
-from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.log import Log, Section, Trajectory
 from kalmark.logs.source import Format, Request
 from kalmark.logs.table_columns import CORNERS, INCREMENT3, TWIST3
 
@@ -71,7 +71,7 @@ def read(path: Path, request: Request) -> Log:
         raise LogError(f"{path}: {error}, expected a recording of the Matlab toolbox") from None
 
 
-def log_of_recording(path: Path, content: dict[str, Any], request: Request) -> Log:
+def log_of_recording(path: Path, content: Section, request: Request) -> Log:
     """Return the log of a recording that has been parsed."""
     cfg, lines = content["cfg"], is_lines(content["cfg"])
     robots = parts("robot", cfg["Robot"])
@@ -94,7 +94,7 @@ def log_of_recording(path: Path, content: dict[str, Any], request: Request) -> L
     )  # fmt: skip
 
 
-def frame_events(frame: dict[str, Any], t_ns: int, lines: bool) -> Iterator[Event]:
+def frame_events(frame: Section, t_ns: int, lines: bool) -> Iterator[Event]:
     """Yield the control of each robot in one frame, and what each of its sensors saw."""
     for robot in as_list(frame["rob"]):
         name = f"robot{robot['rob']}"
@@ -115,7 +115,7 @@ def ids_and_columns(ids: Any, matrix: Any, size: int) -> tuple[list[int], Array]
 
 
 def tracks(
-    path: Path, cfg: dict[str, Any], robots: list[Part], step_ns: int
+    path: Path, cfg: Section, robots: list[Part], step_ns: int
 ) -> tuple[dict[str, Trajectory], dict[str, dict[str, float]]]:
     """Return the true trajectories and the toolbox's own figures, from the file of numbers beside the recording."""
     numbers = path.with_name(path.name.removesuffix(".json.gz") + ".npz")
@@ -153,7 +153,7 @@ class Part:
 
     name: str
     index: int
-    settings: dict[str, Any]
+    settings: Section
 
 
 def parts(word: str, settings: Any) -> list[Part]:
@@ -161,12 +161,12 @@ def parts(word: str, settings: Any) -> list[Part]:
     return [Part(f"{word}{i + 1}", i, one) for i, one in enumerate(as_list(settings))]
 
 
-def is_lines(cfg: dict[str, Any]) -> bool:
+def is_lines(cfg: Section) -> bool:
     """Return whether the recording maps lines, not points."""
     return str(cfg["Opt"]["init"]["initType"]).endswith("Lin")
 
 
-def configuration(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
+def configuration(cfg: Section, robots: list[Part]) -> Section:
     """Return the configuration with which kalmark repeats a recording, its landmark type included."""
     opt, ends = cfg["Opt"], {}
     if is_lines(cfg):  # what becomes of the segment that is kept beside a line
@@ -179,19 +179,19 @@ def configuration(cfg: dict[str, Any], robots: list[Part]) -> dict[str, Any]:
     }
 
 
-def landmark_type(init: dict[str, Any]) -> dict[str, Any]:
+def landmark_type(init: Section) -> Section:
     """Return the landmark type of a recording, with the prior of the numbers that one image does not determine."""
     kind = init["initType"]
     prior = init["plkLin" if kind in PLUECKER else "idpPnt"]
     mean, sigma = as_vector(prior["nonObsMean"]), as_vector(prior["nonObsStd"])
-    section: dict[str, Any] = {"type": LANDMARKS[kind]}
+    section: Section = {"type": LANDMARKS[kind]}
     if kind in PLUECKER:
         names = ("prior_beta_1", "prior_beta_2", "sigma_beta_1", "sigma_beta_2")
         return section | dict(zip(names, mean + sigma, strict=True))
     return section if kind == "eucPnt" else section | {"prior_rho_per_m": mean[0], "sigma_rho_per_m": sigma[0]}
 
 
-def described_robot(cfg: dict[str, Any], robot: Part) -> dict[str, Any]:
+def described_robot(cfg: Section, robot: Part) -> Section:
     """Return the section of one robot."""
     sensors = [one for one in parts("camera", cfg["Sensor"]) if one.settings["robot"] == robot.index + 1]
     return {
@@ -201,7 +201,7 @@ def described_robot(cfg: dict[str, Any], robot: Part) -> dict[str, Any]:
     }
 
 
-def motion(kind: str, noise: Array) -> dict[str, Any]:
+def motion(kind: str, noise: Array) -> Section:
     """Return the motion model; `noise` (6, 6) is the covariance of one control."""
     sigmas = np.sqrt(np.diag(noise)).tolist()
     turn = root_mean_square(sigmas[3:])
@@ -211,9 +211,9 @@ def motion(kind: str, noise: Array) -> dict[str, Any]:
     return {"type": "odometry_3d", **along, "sigma_rotation_rad": turn}
 
 
-def start_section(settings: dict[str, Any], state: Array) -> dict[str, Any]:
+def start_section(settings: Section, state: Array) -> Section:
     """Return the start of a robot; standard deviations of roll, pitch and yaw are taken about x, y and z."""
-    section: dict[str, Any] = describe_pose(state[WXYZ_TO_XYZW]) | {
+    section: Section = describe_pose(state[WXYZ_TO_XYZW]) | {
         "sigma_position_m": as_vector(settings["positionStd"]),
         "sigma_rotation_deg": as_vector(settings["orientationStd"]),
     }
@@ -224,12 +224,12 @@ def start_section(settings: dict[str, Any], state: Array) -> dict[str, Any]:
     return section
 
 
-def camera_section(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
+def camera_section(cfg: Section, sensor: Part) -> Section:
     """Return the section of one camera: its model, mount, and which landmarks of an image it takes."""
     settings, opt = sensor.settings, cfg["Opt"]
     width, height = settings["imageSize"]
     k = np.asarray(settings["intrinsic"], dtype=np.float64).tolist()
-    section: dict[str, Any] = {"type": "pinhole", "cx_px": k[0], "cy_px": k[1]}
+    section: Section = {"type": "pinhole", "cx_px": k[0], "cy_px": k[1]}
     if settings["type"] == "omniCam":
         section |= {"type": "omnidirectional", "c": k[2], "d": k[3], "e": k[4]}
         section["projection"] = as_vector(settings["distortion"])
@@ -241,7 +241,7 @@ def camera_section(cfg: dict[str, Any], sensor: Part) -> dict[str, Any]:
         else:
             section |= {"lens": "radial", "distortion": as_vector(settings["distortion"])}
     section |= {"width_px": int(width), "height_px": int(height), "sigma_px": float(settings["pixErrorStd"])}
-    mount: dict[str, Any] = describe_pose(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
+    mount: Section = describe_pose(np.array(cfg["SenFrame"][sensor.index], dtype=np.float64)[WXYZ_TO_XYZW])
     if settings["frameInMap"]:
         mount |= {"sigma_position_m": as_vector(settings["positionStd"])}
         mount |= {"sigma_rotation_deg": as_vector(settings["orientationStd"])}

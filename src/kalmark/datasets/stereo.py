@@ -19,7 +19,7 @@ from kalmark.declare import Number
 from kalmark.errors import LogError
 from kalmark.files import read_arrays
 from kalmark.geometry.named_poses import describe_pose
-from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.log import Log, Section, Trajectory
 from kalmark.logs.source import Format, Request, frame, one_robot
 from kalmark.logs.table_columns import TWIST3
 
@@ -35,9 +35,7 @@ STARRY = (
 KITTI = ("features", "time_stamps", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
 
 
-def robot_section(
-    camera: tuple[Any, ...], size: tuple[int, int], pixels: Any, mount: Array, rates: Any
-) -> dict[str, Any]:
+def robot_section(camera: tuple[Any, ...], size: tuple[int, int], pixels: Any, mount: Array, rates: Any) -> Section:
     """Return the section of a robot: `camera` has fx, fy, cx, cy and the baseline, `pixels` and `rates` the sigmas."""
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "baseline_m")
     stereo = {"type": "stereo"} | dict(zip(names, map(float, camera), strict=True))

@@ -23,6 +23,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import short_text
 from kalmark.geometry.named_poses import describe_pose
+from kalmark.logs.log import Section
 from kalmark.logs.source import frame, number_of_text, read_mapping, spelling_hint
 
 INTRINSICS = ("fx_px", "fy_px", "cx_px", "cy_px")
@@ -37,7 +38,7 @@ PINHOLES = (None, "pinhole", "kannalabrandt8")  # of `camera_model` and `Camera.
 DEEPEST = 3
 
 
-def lens(model: str, coefficients: Sequence[float]) -> dict[str, Any]:
+def lens(model: str, coefficients: Sequence[float]) -> Section:
     """Return the keys of a lens, by the name that programs have for it.  Raises ValueError: value and expectation."""
     name, d = LENSES.get(model.lower()), [float(each) for each in coefficients]
     if name is None:
@@ -49,7 +50,7 @@ def lens(model: str, coefficients: Sequence[float]) -> dict[str, Any]:
     return {"lens": name, "distortion": d + [0.0] * (4 - len(d)) if name == "radtan" and any(d) else d}
 
 
-def read_calibration(path: Path, camera: str | None = None) -> dict[str, Any]:
+def read_calibration(path: Path, camera: str | None = None) -> Section:
     """Return a calibration as the keys of a `pinhole`: intrinsics, size, lens, distortion and, if known, the mount.
 
     `camera` names one of several in the file.  Raises LogError: file, key, value and what was expected.
@@ -70,7 +71,7 @@ def read_calibration(path: Path, camera: str | None = None) -> dict[str, Any]:
     return _Calibration(path, found[next(iter(found)) if camera is None else camera]).section()
 
 
-def _cameras(content: dict[str, Any], name: str, depth: int = 0) -> Iterator[tuple[str, dict[str, Any]]]:
+def _cameras(content: Section, name: str, depth: int = 0) -> Iterator[tuple[str, Section]]:
     """Yield the cameras of a file by their names; keys are in small letters, without ORB-SLAM's `Camera.`."""
     own = {str(key).lower().removeprefix("camera.").removeprefix("camera1."): value for key, value in content.items()}
     if {"camera_matrix", "intrinsics", "fx"} & own.keys():
@@ -84,16 +85,16 @@ def _cameras(content: dict[str, Any], name: str, depth: int = 0) -> Iterator[tup
 class _Calibration:
     """One camera of a file."""
 
-    def __init__(self, path: Path, content: dict[str, Any]) -> None:
+    def __init__(self, path: Path, content: Section) -> None:
         self.path, self.content = path, content
 
-    def section(self) -> dict[str, Any]:
+    def section(self) -> Section:
         """Return the keys of the camera."""
         model = self.word("camera_model") or self.word("type")
         if model not in PINHOLES:
             raise self.error("camera_model", model, "pinhole")
         k = self.intrinsics()
-        section: dict[str, Any] = dict(zip(INTRINSICS, k, strict=True)) | self.size() | self.lens(k)
+        section: Section = dict(zip(INTRINSICS, k, strict=True)) | self.size() | self.lens(k)
         mount = self.mount()
         return section if mount is None else section | {"mount": describe_pose(mount)}
 
@@ -124,7 +125,7 @@ class _Calibration:
             raise self.error("image size", pair, "whole numbers above 0")
         return dict(zip(("width_px", "height_px"), map(int, pair), strict=False))
 
-    def lens(self, k: list[float]) -> dict[str, Any]:
+    def lens(self, k: list[float]) -> Section:
         """Return the lens and its distortion."""
         given = self.word("distortion_model") or self.word("type") or ("fisheye" if self.fisheye() else "radtan")
         name = next((n for n in ("distortion_coefficients", "distortion_coeffs") if n in self.content), None)

@@ -15,12 +15,12 @@ from kalmark.errors import LogError, PluginError, one_line
 from kalmark.events import Event, Fix, Scan, short_text, sort_key
 from kalmark.logs.download import find_data
 from kalmark.logs.increments import cut_increments
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, Names
 from kalmark.logs.log_corrections import correct_log
 from kalmark.logs.native import NATIVE, stream
 from kalmark.logs.overflow import refuse_overflow
 from kalmark.logs.poses import KITTI, TUM, read_path
-from kalmark.logs.source import Format, Request, choice, quantity, raise_refusal, spelling_hint
+from kalmark.logs.source import Format, Request, choice, one_of, quantity, raise_refusal
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3
 from kalmark.plugins import load_all
 
@@ -119,7 +119,7 @@ def stream_log(
     return (event for event in stream(found, request) if request.includes(event.robot))
 
 
-def request_of(robots: tuple[str, ...] | None, on_error: str, progress: bool = False) -> Request:
+def request_of(robots: Names | None, on_error: str, progress: bool = False) -> Request:
     """Return the request of the caller.  Raises LogError."""
     skipped: list[str] = []
     refuse = (
@@ -151,12 +151,12 @@ def with_poses(
         )
     given = ((sigma_m, "sigma_fixes_m"), (sigma_z_m, "sigma_fixes_z_m"))
     sigmas = [quantity(sigma, name, 1e-9) for sigma, name in given if sigma is not None]
-    events = [
-        Fix(t_ns=t_ns, robot=robot, y=pose[:d], cov=np.diag(np.square([sigmas[0], sigmas[0], sigmas[-1]][:d])))
-        for robot, path in places.items()
-        for d in (_dimensions(log, robot),)
-        for t_ns, pose in zip(path.t_ns.tolist(), path.poses, strict=True)
-    ]
+    events: list[Fix] = []
+    for robot, path in places.items():
+        d = 3 if any("z" in column for column in log.control_columns.get(robot, ("z",))) else 2
+        cov = np.diag(np.square([sigmas[0], sigmas[0], sigmas[-1]][:d]))
+        times = path.t_ns.tolist()
+        events += [Fix(t_ns=t, robot=robot, y=y, cov=cov) for t, y in zip(times, path.poses[:, :d], strict=True)]
     found = sorted([*log.events, *events], key=sort_key) if events else log.events
     return replace(log, events=found, truth=log.truth | true) if true or events else log
 
@@ -178,12 +178,6 @@ def _names(log: Log, name: str, given: Any) -> dict[str, str] | None:
     return {robot: str(path.resolve()) for robot, path in _by_robot(log, name, given).items()} or None
 
 
-def _dimensions(log: Log, robot: str) -> int:
-    """Return 2 for a robot with controls of the plane, 3 for another."""
-    columns = log.control_columns.get(robot, ("z",))
-    return 3 if any("z" in column for column in columns) else 2
-
-
 def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
     """Return the format of the log at `path` and the path its reader takes.  Raises LogError."""
     known, missing = known_formats(), _of_plugins()[1]
@@ -191,9 +185,7 @@ def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
         if format in missing:
             raise LogError(f"log format is {format!r}: {missing[format]}")
         if format not in known:
-            raise LogError(
-                f"log format is {format!r}, expected one of {', '.join(known)}{spelling_hint(format, known)}"
-            )
+            raise LogError(f"log format is {format!r}, {one_of(known, format)}")
         found = known[format].find(path)
         if found is None:
             raise LogError(f"{path}: not a log of format {format}, expected {known[format].what}")
@@ -210,7 +202,7 @@ def recognise(path: Path, format: str | None) -> tuple[Format, Path]:
     raise LogError(f"{path}: no known log format, expected one of {kinds}{hint}{without}")
 
 
-def robot_names(robots: Any, prefix: str = "") -> tuple[str, ...] | None:
+def robot_names(robots: Any, prefix: str = "") -> Names | None:
     """Return the names of the robots asked for; a number is put behind the format's prefix."""
     if robots is None:
         return None
@@ -226,8 +218,7 @@ def keep_robots(log: Log, request: Request) -> Log:
         return log
     for robot in request.robots:
         if robot not in log.robots:
-            hint = spelling_hint(robot, log.robots)
-            raise LogError(f"{log.path or log.name}: no robot {robot!r}, expected one of {', '.join(log.robots)}{hint}")
+            raise LogError(f"{log.path or log.name}: no robot {robot!r}, {one_of(log.robots, robot)}")
     entry = known_formats().get(log.format)
     others = {*log.robots, *(entry.robots if entry else ())} - {*request.robots}
     left_out: Counter[str] = Counter()

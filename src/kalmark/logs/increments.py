@@ -19,7 +19,7 @@ from kalmark.arrays import Array
 from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.geometry.angles import V, V_inverse
 from kalmark.geometry.rotations import left_jacobian, left_jacobian_inverse
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, Names
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, WHEELS
 
 LONG = 5  # usual intervals: a longer one may be of a gap, of which the increment is only the end
@@ -43,7 +43,7 @@ def cut_increments(log: Log) -> Log:
     return replace(log, events=sorted(events, key=sort_key))
 
 
-def _parts(controls: list[Control], columns: tuple[str, ...], asked: list[int]) -> Iterator[Control]:
+def _parts(controls: list[Control], columns: Names, asked: list[int]) -> Iterator[Control]:
     """Yield the increments of a robot with these columns, those cut within which there are times (ns) asked for.
 
     The first began one interval, that to the second, before its end, as for `begins_at`.
@@ -80,7 +80,7 @@ def unevenness(a: float, b: float) -> float:
     return (b - a) ** 2 * (a**3 + (1 - b) ** 3) / (3 * (1 - (b - a)))
 
 
-def part_of(u: Array, columns: tuple[str, ...], share: float) -> Array:
+def part_of(u: Array, columns: Names, share: float) -> Array:
     """Return the part of an increment (k,) that a constant twist makes in a share of its time.
 
     A twist (v, w) moves by V(w) v and turns by w: of a share f these are V(f w) f v and f w.  [S] (57)-(60) composed.

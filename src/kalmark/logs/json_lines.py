@@ -7,11 +7,12 @@ from typing import Any
 
 from kalmark.errors import EventError
 from kalmark.events import Control, Event, Fix, Scan, short_text
-from kalmark.logs.source import spelling_hint
+from kalmark.logs.log import Names
+from kalmark.logs.source import reason_of, spelling_hint
 
 LONGEST_LINE = 10_000_000  # characters: more than any scan has
 _TIMES = ("t_s", "t_ns", "robot")
-KEYS: dict[str, tuple[type[Control | Scan | Fix], tuple[str, ...]]] = {
+KEYS: dict[str, tuple[type[Control | Scan | Fix], Names]] = {
     "control": (Control, (*_TIMES, "u", "cov", "share", "uneven")),
     "scan": (Scan, (*_TIMES, "sensor", "y", "ids", "cov", "classes")),
     "fix": (Fix, (*_TIMES, "y", "cov")),
@@ -28,7 +29,7 @@ def mapping_of(line: str) -> dict[str, Any]:
     except RecursionError:
         raise EventError(f"{short_text(line)} is nested too deeply, expected an object of JSON") from None
     except ValueError as error:
-        reason = " ".join(str(error).split())[:120]
+        reason = reason_of(error, 120)
         raise EventError(f"{short_text(line)} is no JSON ({reason}), expected an object on one line") from None
     if not isinstance(given, dict):
         raise EventError(f"{short_text(line)} is no object, expected one with a type, a time and a robot")

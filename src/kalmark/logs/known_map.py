@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection, Sequence
 from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +14,7 @@ from kalmark.arrays import Array
 from kalmark.errors import LogError
 from kalmark.events import Id
 from kalmark.logs.geodesy import Globe
+from kalmark.logs.log import Names
 from kalmark.logs.source import Request, raise_refusal
 from kalmark.logs.table import Refused, Row, read_table
 
@@ -19,8 +22,6 @@ PLACES = ("x_m", "y_m", "z_m", "signature", "qx", "qy", "qz", "qw")
 HIGH = PLACES[:3]
 TAG = (*HIGH, *PLACES[4:])
 KINDS = {PLACES[:2], (*PLACES[:2], "signature"), HIGH, TAG}
-LETTERS = {"x_m": "x", "y_m": "y", "z_m": "z", "signature": "s"}
-TURNS = ("rx", "ry", "rz")  # of a pose's error, after its position
 
 
 class KnownLandmark(NamedTuple):
@@ -32,7 +33,7 @@ class KnownLandmark(NamedTuple):
     id: Id
     mean: Array
     cov: Array | None = None
-    columns: tuple[str, ...] = ()
+    columns: Names = ()
 
 
 def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> list[KnownLandmark]:
@@ -61,18 +62,33 @@ def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> 
     return [*found.values()]
 
 
-def _covariance(row: Row, names: tuple[str, ...]) -> Array | None:
+def errors_of(names: Collection[str]) -> list[str]:
+    """Return the components of the error of a place with these columns; that of a quaternion is a rotation vector."""
+    straight = ["s" if name == "signature" else name.removesuffix("_m") for name in names if not name.startswith("q")]
+    return straight + ["rx", "ry", "rz"] * ("qw" in names)
+
+
+def cov_names(names: Collection[str]) -> list[str]:
+    """Return the columns of the upper triangle of the covariance of that error, row by row."""
+    return [f"cov_{a}{b}" for a, b in combinations_with_replacement(errors_of(names), 2)]
+
+
+def from_triangle(values: Sequence[float]) -> Array:
+    """Return the symmetric matrix (n, n) with this upper triangle, row by row."""
+    size = (math.isqrt(8 * len(values) + 1) - 1) // 2
+    whole, rows = np.empty((size, size)), np.triu_indices(size)
+    whole[rows] = whole.T[rows] = values
+    return whole
+
+
+def _covariance(row: Row, names: Names) -> Array | None:
     """Return the covariance of a landmark's error, None if its columns are empty or zero."""
-    letters = [LETTERS[name] for name in names if name in LETTERS] + [*TURNS] * ("qw" in names)
-    cov = np.zeros((len(letters), len(letters)))
-    pairs = list(combinations_with_replacement(range(len(letters)), 2))
-    columns = [f"cov_{letters[i]}{letters[j]}" for i, j in pairs]
+    columns = cov_names(names)
     given = [column for column in columns if column in row.table.index and row.text(column)]
     if not given:
         return None
     if given != columns:
         missing = next(column for column in columns if column not in given)
         raise Refused(f"{missing} is empty, expected all of {', '.join(columns)}, or none")
-    for (i, j), value in zip(pairs, row.numbers(tuple(columns)), strict=True):
-        cov[i, j] = cov[j, i] = value
+    cov = from_triangle(row.numbers(tuple(columns)))
     return cov if cov.any() else None

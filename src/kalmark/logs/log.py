@@ -15,6 +15,10 @@ from kalmark.events import Control, Event, Id, Scan, list_names
 from kalmark.geometry.angles import wrap
 
 Times = Index
+Names = tuple[str, ...]  # of robots, of sensors, or of the columns of one
+Section = dict[str, Any]  # a mapping of plain values, as a part of a configuration or another YAML file
+LandmarkPlaces = dict[Id, Array]  # of landmarks
+SensorKey = tuple[str, str]  # robot, sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,22 +167,22 @@ class Log:
     """
 
     name: str
-    robots: tuple[str, ...]
+    robots: Names
     events: list[Event]
     format: str = "native"
     path: Path | None = None
     truth: dict[str, Trajectory] = field(default_factory=dict)
-    landmarks: dict[Id, Array] = field(default_factory=dict)
+    landmarks: LandmarkPlaces = field(default_factory=dict)
     gps: dict[str, PositionTrack] = field(default_factory=dict)
     skipped: list[str] = field(default_factory=list)
-    control_columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    sensor_columns: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
-    places: dict[tuple[str, str], tuple[Path, int]] = field(default_factory=dict)
-    describes: dict[str, Any] = field(default_factory=dict)
+    control_columns: dict[str, Names] = field(default_factory=dict)
+    sensor_columns: dict[SensorKey, Names] = field(default_factory=dict)
+    places: dict[SensorKey, tuple[Path, int]] = field(default_factory=dict)
+    describes: Section = field(default_factory=dict)
     reference: dict[str, dict[str, float]] = field(default_factory=dict)
     true_ids: dict[Scan, tuple[Id | None, ...]] = field(default_factory=dict)
     origin: Array | None = None
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Section = field(default_factory=dict)
 
     def __repr__(self) -> str:
         span = f" in {(self.events[-1].t_ns - self.events[0].t_ns) * 1e-9:.1f} s" if self.events else ""

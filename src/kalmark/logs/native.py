@@ -41,7 +41,7 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, fixed_seconds, short_text, sort_events, sort_key
 from kalmark.logs.geodesy import Globe, origin_of
 from kalmark.logs.image_files import Album
-from kalmark.logs.log import Log, PositionTrack, Trajectory
+from kalmark.logs.log import LandmarkPlaces, Log, Names, PositionTrack, Section, SensorKey, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, read_mapping, spelling_hint
 from kalmark.logs.table import PARQUET, Content, Refused, Row, read_table
 from kalmark.logs.table_columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
@@ -55,7 +55,7 @@ WALL = ("x_m", "y_m", "x2_m", "y2_m")
 LANDMARKS = (POSITION[:2], WALL, POSITION, LANDMARK3[:6], POSE3)
 """The columns of a point and a wall of the plane, and of a point, a line and a tag, as `Log.landmarks` has them."""
 
-Places = dict[tuple[Path, str, str], int]
+Begins = dict[tuple[Path, str, str], int]
 """The line where a robot's controls and fixes (sensor "") and its scans by each sensor begin in a file."""
 
 NEAR = 0.65  # of difflib's ratio
@@ -99,7 +99,7 @@ def tables(path: Path) -> dict[str, Path]:
 
 
 def log_of_tables(
-    there: Mapping[str, Path | Content], request: Request, called: str, path: Path | None, describes: dict[str, Any],
+    there: Mapping[str, Path | Content], request: Request, called: str, path: Path | None, describes: Section,
     globe: Globe | None = None,
 ) -> Log:  # fmt: skip
     """Return the log of tables, by the names of their CSV files.  Raises LogError with file and line."""
@@ -123,7 +123,7 @@ def log_of_tables(
     )  # fmt: skip
 
 
-def read_rig(path: Path) -> dict[str, Any]:
+def read_rig(path: Path) -> Section:
     """Return the content of `rig.yaml`.  Raises LogError if it is no mapping with a mapping of robots."""
     content = read_mapping(path)
     robots = content.get("robots", {})
@@ -159,10 +159,10 @@ class _Reader:
     def __init__(self, request: Request, in_order: bool = False, globe: Globe | None = None) -> None:
         self.request, self.in_order, self.globe = request, in_order, globe or Globe()
         self.events: list[Event] = []
-        self.columns: dict[tuple[str, str], tuple[str, ...]] = {}
-        self.places: Places = {}
+        self.columns: dict[SensorKey, Names] = {}
+        self.places: Begins = {}
         self.truth: dict[str, Trajectory] = {}
-        self.landmarks: dict[Id, Array] = {}
+        self.landmarks: LandmarkPlaces = {}
         self.gps: dict[str, PositionTrack] = {}
         self.readers: tuple[Callable[[Path | Content], Iterator[Event] | None], ...] = (
             self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps,
@@ -185,7 +185,7 @@ class _Reader:
 
     def scans(self, path: Path | Content) -> Iterator[Event]:
         """Yield the scans of `scans.csv`: one a robot, sensor and time."""
-        scans: dict[tuple[str, str], _Rows] = {}  # those that may still get rows: of each sensor the last
+        scans: dict[SensorKey, _Rows] = {}  # those that may still get rows: of each sensor the last
 
         def make(row: Row) -> list[Event]:
             self.note(row)
@@ -206,7 +206,7 @@ class _Reader:
         for key, rows in scans.items():
             yield from self.closed(path, key, rows)
 
-    def closed(self, path: Path | Content, key: tuple[str, str], rows: _Rows) -> Iterator[Event]:
+    def closed(self, path: Path | Content, key: SensorKey, rows: _Rows) -> Iterator[Event]:
         """Yield the event of the rows of a scan, which has no more; none if all of them are bad."""
         if not rows.y and not rows.empty:
             return
@@ -268,7 +268,7 @@ class _Reader:
         table = read_table(path, ("t_s", "robot", "x_m", "y_m"), allowed=("z_m",), globe=self.globe)
         if not table.noise_columns:
             raise LogError(f"{path}:1: no column of noise, expected cov_xx, cov_xy, cov_yy or sigma_x_m, sigma_y_m")
-        columns: dict[tuple[str, str], tuple[str, ...]] = {}
+        columns: dict[SensorKey, Names] = {}
 
         def make(row: Row) -> Event:
             self.note(row)
@@ -324,7 +324,7 @@ class _Reader:
         self.gps = {robot: PositionTrack.of(rows) for robot, rows in tracks.items()}
 
 
-def known_columns(own: tuple[str, ...] = CANONICAL) -> tuple[str, ...]:
+def known_columns(own: Names = CANONICAL) -> Names:
     """Return these columns and those of the motions and sensors that users have registered."""
     models = [model for role in ("motion", "sensor") for of in classes(role).values() for model in of]
     columns = [name for model in models if not is_own(model) for name in getattr(model, "columns", ())]
@@ -358,7 +358,7 @@ def _by_time(path: Path, events: Iterator[Event]) -> Iterator[Event]:
         yield from sorted(same, key=sort_key)
 
 
-def refuse_misspelt_robots(places: Places, known: Collection[str], request: Request) -> set[str]:
+def refuse_misspelt_robots(places: Begins, known: Collection[str], request: Request) -> set[str]:
     """Refuse the robots whose name seems misspelt, with file and line, and return them.
 
     Or that have nothing in common with the others: scans without controls, where another robot has controls.  Not those
@@ -381,7 +381,7 @@ def refuse_misspelt_robots(places: Places, known: Collection[str], request: Requ
     return strays
 
 
-def _meant(robot: str, files: Mapping[str, Mapping[Path, int]], strays: set[str]) -> tuple[str, ...]:
+def _meant(robot: str, files: Mapping[str, Mapping[Path, int]], strays: set[str]) -> Names:
     """Return the robot of nearly this name that is in another file, or else all that are, unless they are numbered."""
     there = [other for other, lines in files.items() if lines.keys() - files[robot].keys() and other not in strays]
     others = [other for other in there if _letters(other) != _letters(robot)]

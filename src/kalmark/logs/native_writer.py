@@ -15,7 +15,7 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Fix, Frame, Id, Scan, fixed_seconds
 from kalmark.files import replace_folder
 from kalmark.logs.image_files import write_depth, write_image
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, Names
 from kalmark.logs.native import FILES, LANDMARKS, RIG
 from kalmark.logs.source import landmark_id, nanoseconds_of_text
 from kalmark.logs.table import PARQUET, cov_columns
@@ -186,7 +186,7 @@ def time_and_robot(event: Event) -> Row:
     return {"t_s": fixed_seconds(event.t_ns), "robot": name(event.robot)}
 
 
-def numbers(columns: dict[Any, tuple[str, ...]], key: Any, values: Array) -> Row:
+def numbers(columns: dict[Any, Names], key: Any, values: Array) -> Row:
     """Return the numbers (m,) of a control or an observation by column.  Raises LogError if the log names none."""
     names = columns.get(key)
     if names is None or len(names) != len(values):

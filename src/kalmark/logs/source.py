@@ -21,8 +21,8 @@ from kalmark.errors import LogError
 from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, short_text, sort_key
 from kalmark.files import refuse_aliases
 from kalmark.geometry import rotations
-from kalmark.logs.log import Log
-from kalmark.logs.table_columns import in_unit_of
+from kalmark.logs.log import LandmarkPlaces, Log, Names, Section
+from kalmark.logs.table_columns import TIMES, in_unit_of
 
 Refuse = Callable[[str], None]
 """Takes one line about a bad row: raises it as a LogError, or notes it and lets reading go on (`on_error`)."""
@@ -61,7 +61,7 @@ class Request:
     what takes longer than two seconds shows a bar on standard error.
     """
 
-    robots: tuple[str, ...] | None
+    robots: Names | None
     refuse: Refuse
     skipped: list[str]
     progress: bool = False
@@ -92,7 +92,7 @@ class Format:
     robot_prefix: str = ""
     describes_all: bool = False
     general: bool = False
-    robots: tuple[str, ...] = ()
+    robots: Names = ()
     known_maps: Mapping[str, Callable[[Path, bool], list[Any]]] = field(default_factory=dict, hash=False)
 
     @cached_property
@@ -115,8 +115,8 @@ class Format:
 
 
 def one_robot(
-    format: str, path: Path, request: Request, robot: str, events: Iterable[Event], controls: tuple[str, ...],
-    sensors: Mapping[str, tuple[str, ...]], *, name: str = "", **rest: Any
+    format: str, path: Path, request: Request, robot: str, events: Iterable[Event], controls: Names,
+    sensors: Mapping[str, Names], *, name: str = "", **rest: Any
 ) -> Log:  # fmt: skip
     """Return the log of one robot: its events in any order, the columns of its controls (none: ()) and sensors."""
     return Log(
@@ -153,11 +153,21 @@ def spelling_hint(word: str, words: Iterable[str]) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
-def choice(value: Any, name: str, allowed: tuple[str, ...]) -> str:
+def reason_of(error: object, most: int = 160) -> str:
+    """Return the text of an error of a library on one line, so many characters of it; without a text its type."""
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
+def one_of(words: Iterable[str], word: Any) -> str:
+    """Return that one of these words is expected, and the one that was probably meant."""
+    words = list(words)
+    return f"expected one of {', '.join(words)}{spelling_hint(str(word), words)}"
+
+
+def choice(value: Any, name: str, allowed: Names) -> str:
     """Return an option's value if it is one of those allowed.  Raises LogError."""
     if value not in allowed:
-        hint = spelling_hint(str(value), allowed)
-        raise LogError(f"log option {name} is {value!r}, expected one of {', '.join(allowed)}{hint}")
+        raise LogError(f"log option {name} is {value!r}, {one_of(allowed, value)}")
     return str(value)
 
 
@@ -251,7 +261,7 @@ def text_rows(path: Path, text: str | None = None) -> Iterator[tuple[int, list[s
 
 def read_points(
     path: Path, refuse: Refuse, id_of: Callable[[str], Id], sizes: tuple[int, ...], expected: str
-) -> dict[Id, Array]:
+) -> LandmarkPlaces:
     """Return the positions by id in rows `id x y` of so many cells, or {} without the file."""
     points = {}
     for line, cells in text_rows(path) if path.is_file() else ():
@@ -265,7 +275,7 @@ def read_points(
 
 
 def timed_rows(
-    path: Path, names: tuple[str, ...], refuse: Refuse, text: str | None = None
+    path: Path, names: Names, refuse: Refuse, text: str | None = None
 ) -> Iterator[tuple[int, int, list[float]]]:
     """Yield (line, t_ns, numbers) of rows `t_s, *names` whose time never runs back; bad rows go to `refuse`.
 
@@ -293,16 +303,22 @@ def timed_rows(
         raise LogError(f"{path}:1: no rows of data, expected columns {', '.join(('t_s', *names))}")
 
 
-def increasing_times(file: Path) -> Iterator[tuple[int, int, list[str]]]:
-    """Yield (line, t_ns, other cells) of rows that begin with a time in s, which increases.  Raises LogError."""
+def increasing_times(
+    file: Path, rows: Iterable[tuple[int, list[str]]] | None = None, unit: str = "s"
+) -> Iterator[tuple[int, int, list[str]]]:
+    """Yield (line, t_ns, other cells) of the rows of a file that begin with a time, which increases.  Raises LogError.
+
+    The rows are those of white-space separated text if absent.
+    """
     last_ns = -_T_MAX_NS
-    for line, (cell, *rest) in text_rows(file):
+    for line, (cell, *rest) in text_rows(file) if rows is None else rows:
         try:
-            t_ns = nanoseconds_of_text(cell)
+            t_ns = nanoseconds_of_text(cell, TIMES[f"t_{unit}"])
         except ValueError:
-            raise LogError(f"{file}:{line}: {short_text(cell)}, expected a time in s") from None
+            raise LogError(f"{file}:{line}: {short_text(cell)}, expected a time in {unit}") from None
         if t_ns <= last_ns:
-            raise LogError(f"{file}:{line}: the time {cell} s is not after the one before, expected increasing times")
+            what = f"the time {cell} {unit} is not after the one before"
+            raise LogError(f"{file}:{line}: {what}, expected increasing times")
         last_ns = t_ns
         yield line, t_ns, rest
 
@@ -320,7 +336,7 @@ def vector_frame(position: Any, vector: Any) -> Array:
     return np.append(np.asarray(position, dtype=np.float64).reshape(3), turn)
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
+def read_mapping(path: Path) -> Section:
     """Return the content of a YAML file, OpenCV's among them.  Raises LogError if it is none."""
     text = _OPENCV_HEAD.sub("", read_text(path)).replace("!!opencv-matrix", "")
     try:
@@ -328,28 +344,9 @@ def read_mapping(path: Path) -> dict[str, Any]:
     except Exception as error:  # of odd YAML the parser raises anything: unhashable keys, dates, integers, recursion
         where = getattr(error, "problem_mark", None)
         line = where.line + 1 if where is not None else 1
-        problem = " ".join(str(getattr(error, "problem", None) or error).split()) or type(error).__name__
-        raise LogError(f"{path}:{line}: not YAML ({problem[:80]}), expected a mapping") from None
+        problem = reason_of(getattr(error, "problem", None) or error, 80)
+        raise LogError(f"{path}:{line}: not YAML ({problem}), expected a mapping") from None
     refuse_aliases(content, str(path), LogError)
     if not isinstance(content, dict):
         raise LogError(f"{path}:1: holds {type(content).__name__}, expected a mapping")
-    if not _is_plain(content):
-        raise LogError(f"{path}:1: nested deeper than {DEEPEST} levels, or more than {MOST_VALUES} values")
     return content
-
-
-DEEPEST = 12
-MOST_VALUES = 100_000
-
-
-def _is_plain(content: Any) -> bool:
-    """Return whether a YAML file ends: aliases can nest it in itself, or repeat it more often than memory holds."""
-    waiting, count = [(content, 0)], 0
-    while waiting:
-        node, depth = waiting.pop()
-        count += 1
-        if depth > DEEPEST or count > MOST_VALUES:
-            return False
-        below = node.values() if isinstance(node, dict) else node if isinstance(node, list | tuple | set) else ()
-        waiting += [(each, depth + 1) for each in below]
-    return True

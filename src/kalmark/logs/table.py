@@ -25,8 +25,17 @@ from kalmark.errors import LogError
 from kalmark.events import MOST, Id, bound, largest_magnitude, short_text, unit_quaternion
 from kalmark.logs import geodesy
 from kalmark.logs.geodesy import Globe
+from kalmark.logs.log import Names, SensorKey
 from kalmark.logs.progress import track
-from kalmark.logs.source import Request, landmark_id, nanoseconds_of_text, number_of_text, read_text, spelling_hint
+from kalmark.logs.source import (
+    Request,
+    landmark_id,
+    nanoseconds_of_text,
+    number_of_text,
+    read_text,
+    reason_of,
+    spelling_hint,
+)
 from kalmark.logs.table_columns import (
     CANONICAL,
     DIRECTIONS,
@@ -83,8 +92,8 @@ class Table:
 
     path: Path
     index: dict[str, int]
-    value_columns: tuple[str, ...]
-    noise_columns: tuple[str, ...]
+    value_columns: Names
+    noise_columns: Names
     content: Content
     given: dict[str, tuple[str, float]]
     unit_ns: int = TIMES["t_s"]
@@ -109,7 +118,7 @@ class Table:
         If `timed`, refuse those whose time runs backwards, or `strictly` stands still, within a robot (and sensor).
         Raises LogError if there is no row.
         """
-        last: dict[tuple[str, str], Row] = {}
+        last: dict[SensorKey, Row] = {}
         content, row = self.content, None
         shown = request.progress and content.size > 0
         for line, cells in track(content.rows, self.path.name, content.size, show=shown, at=content.at):
@@ -161,7 +170,7 @@ def _of_parquet(path: Path) -> Content:
             for batch in file.iter_batches(BATCH):
                 yield [column.to_pylist() for column in batch.columns]
         except (pyarrow.ArrowException, OSError, ValueError, UnicodeError) as error:
-            reason = " ".join(str(error).split())[:160] or type(error).__name__
+            reason = reason_of(error)
             raise LogError(f"{path}: not a file of Parquet that can be read ({reason}), expected a whole one") from None
 
     found, done = parts(), 0
@@ -220,8 +229,8 @@ def _of_csv(path: Path, separator: str = ",") -> Content:
 
 
 def read_table(
-    source: Path | Content, required: tuple[str, ...], allowed: tuple[str, ...] | None = None,
-    known: tuple[str, ...] = (), globe: Globe | None = None,
+    source: Path | Content, required: Names, allowed: Names | None = None,
+    known: Names = (), globe: Globe | None = None,
 ) -> Table:  # fmt: skip
     """Return the table of a source, which must have the columns `required`.
 
@@ -281,7 +290,7 @@ def columns_in_plane(where: str, header: list[str], given: dict[str, tuple[str, 
     return [GLOBE.get(name, name) for name in header]
 
 
-def header_in_units(header: list[str], known: tuple[str, ...]) -> tuple[list[str], dict[str, tuple[str, float]], int]:
+def header_in_units(header: list[str], known: Names) -> tuple[list[str], dict[str, tuple[str, float]], int]:
     """Return a header in kalmark's units, the names of columns that had others with their factors, and that of times.
 
     Only names that are known, or their standard deviations, have units that are known.
@@ -301,7 +310,7 @@ def header_in_units(header: list[str], known: tuple[str, ...]) -> tuple[list[str
     return out, given, unit_ns
 
 
-def refuse_unit(where: str, name: str, known: tuple[str, ...]) -> None:
+def refuse_unit(where: str, name: str, known: Names) -> None:
     """Refuse a column that is one of `known` but for its unit: without it, in another one, or otherwise written."""
     plain = "_".join(re.findall("[a-z0-9]+", name.lower()))
     stem, _ = split_unit(name)
@@ -339,7 +348,7 @@ class Row:
         self.t_ns, self.robot, self.sensor = 0, "", ""
 
     @property
-    def key(self) -> tuple[str, str]:
+    def key(self) -> SensorKey:
         """Its robot and sensor."""
         return self.robot, self.sensor
 
@@ -398,7 +407,7 @@ class Row:
             raise ValueError(cell)
         return value * table.given[column][1] if column in table.given else value
 
-    def numbers(self, columns: tuple[str, ...]) -> list[float]:
+    def numbers(self, columns: Names) -> list[float]:
         """Return the finite numbers in these columns.  Raises Refused."""
         values, name = [], self.table.name
         for column in columns:
@@ -418,7 +427,7 @@ class Row:
             values[-4:] = unit_quaternion(np.array(values[-4:]), Refused).tolist()
         return values if self.table.globe is None else self._placed(self.table.globe, columns, values)
 
-    def _placed(self, globe: Globe, columns: tuple[str, ...], values: list[float]) -> list[float]:
+    def _placed(self, globe: Globe, columns: Names, values: list[float]) -> list[float]:
         """Return values in which a position on the globe is one in the tangent plane.  Raises Refused."""
         at = [columns.index(name) for name in GLOBE.values() if name in columns]
         if not at:
@@ -433,7 +442,7 @@ class Row:
             values[i] = place
         return values
 
-    def values(self, columns: dict[tuple[str, str], tuple[str, ...]]) -> list[float]:
+    def values(self, columns: dict[SensorKey, Names]) -> list[float]:
         """Return this row's values; the first of its key settles in `columns` which these are.  Raises Refused."""
         used = columns.get(self.key) or tuple(name for name in self.table.value_columns if self.text(name))
         if not used:
@@ -453,9 +462,7 @@ class Row:
         columns.setdefault(self.key, used)
         return values
 
-    def measured(
-        self, columns: dict[tuple[str, str], tuple[str, ...]], *, definite: bool = True
-    ) -> tuple[list[float], Array | None]:
+    def measured(self, columns: dict[SensorKey, Names], *, definite: bool = True) -> tuple[list[float], Array | None]:
         """Return this row's `values` and their own covariance (m, m), None if it gives none.  Raises Refused."""
         y = self.values(columns)
         given = tuple(name for name in self.table.noise_columns if self.text(name))
@@ -469,7 +476,7 @@ class Row:
         return y, cov
 
 
-def covariance_of_cells(given: dict[str, float], columns: tuple[str, ...]) -> Array:
+def covariance_of_cells(given: dict[str, float], columns: Names) -> Array:
     """Return the covariance that `sigma_<column>` or `cov_ij` numbers describe.  Raises Refused."""
     size = len(columns)
     sigmas = [f"sigma_{name}" for name in columns]

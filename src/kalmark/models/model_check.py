@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 import itertools
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,7 +25,7 @@ from kalmark.models import protocols
 from kalmark.models.landmark_views import Spatial
 
 Rng = np.random.Generator
-Batch = Callable[[Array], Any]
+Batch = Callable[[Array], Any]  # of K arguments: their values and Jacobians
 
 TOLERANCE = 1e-5
 STEP = np.cbrt(np.finfo(float).eps)
@@ -84,13 +84,13 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
     at = {"r": r, "u": u, "dt_s": dt_s}
 
     def move(r: Array, u: Array) -> list[Array]:
-        return [np.array(each) for each in zip(*map(model.move, r, u, dt_s), strict=True)]
+        state, R_r, R_u = _arrays(map(model.move, r, u, dt_s))
+        R_r[~np.isfinite(state).all(axis=1)] = np.nan
+        return [state, R_r, R_u]
 
-    state, R_r, R_u = move(r, u)
-    _shape("state of move", state, (DRAWS, space.size))
-    R_r[~np.isfinite(state).all(axis=1)] = np.nan
-    found.jacobian("R_r", R_r, lambda x: move(x, u)[0], r, space, space, at)
-    found.jacobian("R_u", R_u, lambda x: move(r, x)[0], u, Rn(k), space, at)
+    _shape("state of move", move(r, u)[0], (DRAWS, space.size))
+    found.jacobian("R_r", lambda x: move(x, u)[:2], r, space, space, at)
+    found.jacobian("R_u", lambda x: move(r, x)[::2], u, Rn(k), space, at)
     found.covariance("control_noise", [*map(model.control_noise, u)], k, at)
     of_state = isinstance(model, protocols.StateDiffusion)
     gathered = map(model.diffusion_at, r, u, dt_s) if of_state else map(model.diffusion, u, dt_s)
@@ -104,20 +104,15 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
         _shape("calibration_effect", np.array(calibrating.calibration_effect(u[0], dt_s[0])), (k, c))
         if isinstance(calibrating, protocols.NonlinearCalibration):
             of, a = calibrating, rng.normal(0, 1, (DRAWS, c)) * np.sqrt(np.diag(calibrating.calibration_cov))
-
-            def true(a: Array) -> list[Array]:
-                return [np.array(each) for each in zip(*map(of.calibrated, u, a, dt_s), strict=True)]
-
-            found.jacobian("U_a", true(a)[1], lambda x: true(x)[0], a, Rn(c), Rn(k), at | {"a": a})
+            found.jacobian("U_a", lambda x: _arrays(map(of.calibrated, u, x, dt_s)), a, Rn(c), Rn(k), at | {"a": a})
     if protocols.tells_velocity(model):
         size = 6 if space.world == "space" else 3
-        b, B_r = (np.array(each) for each in zip(*(protocols.velocity_in(model, one, u[0]) for one in r), strict=True))
-        _shape("b of the velocity", b, (DRAWS, size))
 
-        def velocity(r: Array) -> Array:
-            return np.array([protocols.velocity_in(model, one, u[0])[0] for one in r])
+        def velocity(r: Array) -> list[Array]:
+            return _arrays(protocols.velocity_in(model, one, u[0]) for one in r)
 
-        found.jacobian("B_r", B_r, velocity, r, space, Rn(size), {"r": r})
+        _shape("b of the velocity", velocity(r)[0], (DRAWS, size))
+        found.jacobian("B_r", velocity, r, space, Rn(size), {"r": r})
 
 
 # ------------------------------------------------------------------ sensors
@@ -140,7 +135,8 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
     kept = _finite("e of expect", y, v)
     v, y, E_v = v[kept], y[kept], E_v[kept]
     p = E_v.shape[1]
-    found.jacobian("E_v", E_v, lambda x: _changing(model, x, y), v, view, Rn(p) if spatial else measured, {"v": v})
+    to = Rn(p) if spatial else measured
+    found.jacobian("E_v", lambda x: (_changing(model, x, y), E_v), v, view, to, {"v": v})
     found.covariance("noise", model.noise(y), p, {"y": y})
     if isinstance(model, protocols.NonAdditiveSensor) and not model.additive:
         found.covariance("noise_at", model.noise_at(v), p, {"v": v})
@@ -148,9 +144,12 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
         _inverse(model, y, view, measured, found, v if isinstance(model, protocols.SeesVelocity) else None)
     if isinstance(model, protocols.Calibrated) and len(model.parameters):
         a = np.tile(model.parameters, (len(v), 1))
-        own = Rn(a.shape[1])
-        E_p, of = model.parameters_jacobian(v), lambda x: _expect(model.with_parameters(x[0]), v, y)[0]
-        found.jacobian("E_p", E_p, of, a, own, measured, {"v": v})
+        E_p = model.parameters_jacobian(v)
+
+        def by_parameters(x: Array) -> tuple[Array, Array]:
+            return _expect(model.with_parameters(x[0]), v, y)[0], E_p
+
+        found.jacobian("E_p", by_parameters, a, Rn(a.shape[1]), measured, {"v": v})
 
 
 def _expect(model: Any, v: Array, y: Array) -> tuple[Array, Array]:
@@ -184,15 +183,14 @@ def _inverse(
     kept = np.flatnonzero(_finite("v of invert", back, y))[: BATCH if sized else None]
     y, back, V_y = y[kept], back[kept], V_y[kept]
 
-    def inverted(x: Array) -> Array:
+    def inverted(x: Array) -> tuple[Array, Array]:
         rows = np.full((len(x), k), np.nan)
         for row, one, whole in zip(rows, x, y, strict=True):
             with suppress(ValueError, ArithmeticError):  # refused, beyond the border of what can be measured
                 row[:] = model.invert(np.append(one, whole[n:])[None])[0][0]
-        return rows
+        return rows, V_y
 
-    of, to = Rn(n) if exact else measured, view if k == d else Rn(k)
-    found.jacobian("V_y", V_y, inverted, y[:, :n], of, to, {"y": y})
+    found.jacobian("V_y", inverted, y[:, :n], Rn(n) if exact else measured, view if k == d else Rn(k), {"y": y})
     if k != 2 * d:
         whole = np.column_stack([back, np.ones(len(back))]) if k == d - 1 else back  # a ray, at any distance
         whole = whole if moving is None else np.column_stack([whole, moving[kept][:, d:]])
@@ -259,17 +257,17 @@ def _from_pose(model: Any, rng: Rng, found: _Findings) -> None:
     space, pose = model.space, SE3 if model.space.world == "space" else SE2
     T, l = _drawn(pose, rng), np.array([_drawn(space, rng) for _ in range(BATCH)])
     Ts, where = np.tile(T, (BATCH, 1)), Rn(3 if space.world == "space" else 2)
-    v, V_T, V_l = model.seen_from(T, l)
+    v, _, V_l = model.seen_from(T, l)
     if np.ndim(v) != 2 or len(v) != BATCH:
         raise ModelError(f"v of seen_from has shape {np.shape(v)}, expected ({BATCH}, d)")
     view = SE3 if v.shape[1] == SE3.size and np.shape(V_l)[1] == SE3.dof else Rn(v.shape[1])
     at: dict[str, Any] = {"T": Ts, "l": l}
-    found.jacobian("V_T", V_T, lambda x: model.seen_from(x[0], l)[0], Ts, pose, view, at)
-    found.jacobian("V_l", V_l, lambda x: model.seen_from(T, x)[0], l, space, view, at)
+    found.jacobian("V_T", lambda x: model.seen_from(x[0], l)[:2], Ts, pose, view, at)
+    found.jacobian("V_l", lambda x: model.seen_from(T, x)[::2], l, space, view, at)
     if isinstance(model, protocols.Reparametrizable):
-        found.jacobian("P_l of to_point", model.to_point(l)[1], lambda x: model.to_point(x)[0], l, space, where, at)
+        found.jacobian("P_l of to_point", model.to_point, l, space, where, at)
     if isinstance(model, protocols.HasPlace):
-        found.jacobian("P_l of place", model.place(l)[1], lambda x: model.place(x)[0], l, space, where, at)
+        found.jacobian("P_l of place", model.place, l, space, where, at)
     if "from_view" not in dir(model):
         return
     if isinstance(model, protocols.Joining):  # a distance, a direction and two ends
@@ -281,11 +279,11 @@ def _from_pose(model: Any, rng: Rng, found: _Findings) -> None:
         if isinstance(model, protocols.Completing):
             v = model.complete(v, np.tile(np.eye(rays * d), (BATCH, 1, 1)), False)[0]
     given = view if v.shape[1] == view.size else Rn(v.shape[1])
-    l, L_T, L_v = model.from_view(T, v)
+    l = model.from_view(T, v)[0]
     _shape("l of from_view", l, (BATCH, space.size))
     at = {"T": Ts, "v": v}
-    found.jacobian("L_T", L_T, lambda x: model.from_view(x[0], v)[0], Ts, pose, space, at)
-    found.jacobian("L_v", L_v, lambda x: model.from_view(T, x)[0], v, given, space, at)
+    found.jacobian("L_T", lambda x: model.from_view(x[0], v)[:2], Ts, pose, space, at)
+    found.jacobian("L_v", lambda x: model.from_view(T, x)[::2], v, given, space, at)
     again, looked = model.seen_from(T, l)[0], v[:, : view.size]
     if isinstance(model, protocols.Segmented) and space.world == "space":  # the plane through both rays
         again, looked = (n / np.linalg.norm(n, axis=1)[:, None] for n in (again, np.cross(v[:, :3], v[:, 3:6])))
@@ -300,15 +298,15 @@ def _function(f: Callable[..., Any], rng: Rng, found: _Findings) -> None:
     results = [f(*x) for x in draws]
     m = np.size(results[0][0])
     for i, n in enumerate(sizes[:count]):
-
-        def value(x: Array, i: int = i, n: int = n) -> Array:
-            given = [(*old[:i], one if n else float(one[0]), *old[i + 1 :]) for old, one in zip(draws, x, strict=True)]
-            return np.array([np.ravel(f(*each)[0]) for each in given])
-
         J = np.array([np.reshape(each[1 + i], (m, max(n, 1))) for each in results])
+
+        def value(x: Array, i: int = i, n: int = n, J: Array = J) -> tuple[Array, Array]:
+            given = [(*old[:i], one if n else float(one[0]), *old[i + 1 :]) for old, one in zip(draws, x, strict=True)]
+            return np.array([np.ravel(f(*each)[0]) for each in given]), J
+
         x = np.array([np.atleast_1d(each[i]) for each in draws])
         at = {f"argument {j + 1}": [each[j] for each in draws] for j in range(len(sizes))}
-        found.jacobian(f"Jacobian {i + 1}", J, value, x, Rn(max(n, 1)), Rn(m), at)
+        found.jacobian(f"Jacobian {i + 1}", value, x, Rn(max(n, 1)), Rn(m), at)
 
 
 def _sizes(f: Callable[..., Any], rng: Rng) -> tuple[tuple[int, ...], int]:
@@ -353,7 +351,7 @@ def _differences(f: Batch, x: Array, of: Space, to: Space, h: float) -> Array:
     for i in range(of.dof):
         step = np.zeros((len(x), of.dof))
         step[:, i] = h * np.maximum(1.0, np.abs(x[:, i]) if of.dof == of.size else 1.0)
-        ends = [f(np.array([of.plus(*each) for each in zip(x, d, strict=True)])) for d in (step, -step)]
+        ends = [f(np.array([of.plus(*each) for each in zip(x, d, strict=True)]))[0] for d in (step, -step)]
         rise = np.array([to.minus(*each) for each in zip(*ends, strict=True)])
         columns.append(rise / (2 * step[:, i, None]))
     return np.stack(columns, axis=-1)
@@ -365,9 +363,9 @@ class _Findings:
 
     worst: dict[str, CheckResult] = field(default_factory=dict)
 
-    def jacobian(self, what: str, J: Any, f: Batch, x: Array, of: Space, to: Space, at: dict[str, Any]) -> None:
-        """Compare J (K, to.dof, of.dof) with the differences of f at x (K, of.size)."""
-        J = np.asarray(J, dtype=np.float64)
+    def jacobian(self, what: str, f: Batch, x: Array, of: Space, to: Space, at: dict[str, Any]) -> None:
+        """Compare the Jacobian (K, to.dof, of.dof) of f at x (K, of.size) with the differences of its values."""
+        J = np.asarray(f(x)[1], dtype=np.float64)
         _shape(what, J, (len(x), to.dof, of.dof))
         fine, coarse = (_differences(f, x, of, to, h) for h in (STEP, 2 * STEP))
         smooth = np.abs(coarse - fine) <= TOLERANCE / 2 * (1 + np.abs(fine))
@@ -396,6 +394,11 @@ class _Findings:
         if what not in self.worst or error[i] > self.worst[what].error:
             where = ", ".join(f"{name} = {_show(x[i])}" for name, x in at.items())
             self.worst[what] = CheckResult(what, float(error[i]), where or "the model")
+
+
+def _arrays(results: Iterable[Any]) -> list[Array]:
+    """Return results, tuples one a draw, as an array (K, ...) for each of their parts."""
+    return [np.array(each) for each in zip(*results, strict=True)]
 
 
 def _finite(what: str, y: Array, x: Array) -> Any:

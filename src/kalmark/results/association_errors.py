@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.arrays import Array
 from kalmark.events import Id
+from kalmark.logs.log import LandmarkPlaces
 from kalmark.results.figure_texts import Figures
 from kalmark.results.history import History, as_id
 from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks
@@ -73,7 +73,7 @@ def no_ids(run: Recording) -> bool:
     )
 
 
-def by_position(landmarks: MapLandmarks, true: dict[Id, Array]) -> dict[Id, Id]:
+def by_position(landmarks: MapLandmarks, true: LandmarkPlaces) -> dict[Id, Id]:
     """Return the true landmark of each point of a map that has one: the nearest to each other, both in the map's frame.
 
     A pair counts if it is closer than half the way from the true landmark to the next true one: every error is below

@@ -8,9 +8,7 @@ from contextlib import suppress
 from copy import deepcopy
 from typing import Any
 
-from kalmark.config.opening import open_config_log
-from kalmark.config.reading import config_of, validate
-from kalmark.config.schema import Config
+from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree
 from kalmark.errors import KalmarkError
 from kalmark.events import Frame
@@ -58,13 +56,13 @@ class Pictures:
 def _read_again(run: Recording) -> Log | None:
     """Return the log of a run that was loaded, None if no camera of it has a detector, or the log is not there."""
     searched = any(run.section(camera.robot, camera.sensor).get("detector") for camera in run.history.cameras)
-    section = run.config.get("log")
-    if not searched or not isinstance(section, dict) or run.log.path is None:
+    if not searched:
         return None
-    log = None
+    from kalmark.results.batch import log_of_run  # heavy, and seldom needed
+
+    log: Any = None
     with suppress(KalmarkError):
-        run.run_plugins()
-        log = open_config_log(validate(Tree({"log": section}), Config), run.log.path)
+        log = log_of_run(run)
         config = config_of(Tree(deepcopy(dict(run.config))), None)
         for name in entry_points_of("keys"):
             log = load("keys", name).with_events(config, log)

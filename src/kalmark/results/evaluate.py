@@ -17,7 +17,7 @@ from kalmark.results.association_errors import association_figures, best_known, 
 from kalmark.results.control_gaps import gap_figures, gap_notes
 from kalmark.results.figure_texts import Figures, count, figure
 from kalmark.results.history import History, Ints
-from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks
+from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks, across_line
 from kalmark.results.measures import (
     Rigid,
     aligned_rmse,
@@ -292,8 +292,7 @@ def line_figures(landmarks: MapLandmarks, truth: Truth) -> Figures:
     for i, place, P in zip(landmarks.ids, landmarks.means, landmarks.covariances, strict=True):
         if str(i) not in true or len(place) != 2 * d or not np.isfinite(P).all():
             continue
-        along = place[d:] - place[:d]
-        across = np.eye(d) - np.outer(along, along) / np.maximum(along @ along, 1e-300)
+        across = across_line(place.reshape(2, d))
         if max(_sigma(across @ P[k : k + d, k : k + d] @ across) for k in (0, d)) < SETTLED * extent:
             errors.append((true[str(i)] - place[:d]) @ across)
     return {"line_rmse_raw_m": rmse(np.reshape(errors, (-1, d))), "lines_compared": len(errors)}

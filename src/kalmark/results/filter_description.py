@@ -17,7 +17,8 @@ from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth, se
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
 from kalmark.results.history import NONE, WHOLE, Biased, CalibratedMount, Camera, Measuring
-from kalmark.results.landmark_table import LINE, TINY
+from kalmark.results.landmark_table import LINE
+from kalmark.results.measures import correlations_of
 from kalmark.results.truth import as_rigid
 from kalmark.slam.description import describe
 from kalmark.slam.held_control import bias_name
@@ -80,7 +81,7 @@ def cameras(slam: Slam) -> tuple[Camera, ...]:
         sensor, columns = mount.sensor, tuple(mount.sensor.columns)
         if columns[0].endswith("_px") and isinstance(sensor, Imaging):
             size = (float(sensor.width_px), float(sensor.height_px))
-            found.append(Camera(robot, name, mount_now(slam, robot, name), size, columns, _corners(sensor)))
+            found.append(Camera(robot, name, mount_now(slam, robot, name), size, columns, _corners(sensor, *size)))
     return tuple(found)
 
 
@@ -137,9 +138,8 @@ def observed_points(slam: Slam, robot: str, sensor: str, pose: Array, y: Array) 
     return out
 
 
-def _corners(sensor: Imaging) -> Array:
+def _corners(sensor: Any, width: float, height: float) -> Array:
     """Return the rays (4, 3), z = 1, to the corners of the image of a camera without distortion."""
-    width, height = float(sensor.width_px), float(sensor.height_px)
     u, v = np.array([0.0, width, width, 0.0]), np.array([0.0, 0.0, height, height])
     if not isinstance(sensor, Focal):
         across, down = u / width - 0.5, v / height - 0.5
@@ -184,6 +184,4 @@ def correlations_kept(slam: Slam, ids: Sequence[Id]) -> Any:
     """Return the correlations (n, n) of robots and landmarks as parts of `WHOLE`, `NONE` of a large map."""
     if len(ids) > KEPT:
         return NONE
-    P = slam.covariance(*slam.robots, *ids)
-    sigma = np.sqrt(np.maximum(np.diagonal(P), TINY))
-    return np.clip(np.round(WHOLE * P / np.outer(sigma, sigma)), -WHOLE, WHOLE).astype(np.int8)
+    return np.round(WHOLE * correlations_of(slam.covariance(*slam.robots, *ids))).astype(np.int8)

@@ -11,7 +11,7 @@ from kalmark.arrays import Array
 from kalmark.errors import KalmarkError, MapError
 from kalmark.events import Fix, Id, Scan, short_text
 from kalmark.geometry.pose_frames import ORIGIN
-from kalmark.logs.log import Log, begins_at, poses_of_size
+from kalmark.logs.log import LandmarkPlaces, Log, begins_at, poses_of_size
 from kalmark.picture_options import Picture
 from kalmark.report import Report
 from kalmark.results.filter_description import cameras, mount_now, observed_points
@@ -163,7 +163,7 @@ def _poses_by_robot(given: Any, names: tuple[str, ...], size: int, what: str) ->
         raise KalmarkError(f"draw: {what} is {short_text(given)}, expected {wanted}") from None
 
 
-def truth_until_now(slam: Slam, truth: Any, size: int) -> tuple[dict[str, Array], dict[Id, Array]]:
+def truth_until_now(slam: Slam, truth: Any, size: int) -> tuple[dict[str, Array], LandmarkPlaces]:
     """Return the true poses (N, size) of robots up to now and the true landmarks, in the frame of the map."""
     if isinstance(truth, Log):
         return _logged_truth(slam, truth, size)
@@ -186,7 +186,7 @@ def truth_to_map(slam: Slam, log: Log, size: int) -> Rigid:
     return as_rigid(ORIGIN[size] if anchored else frame_offset(log.truth, starts, size))
 
 
-def _logged_truth(slam: Slam, log: Log, size: int) -> tuple[dict[str, Array], dict[Id, Array]]:
+def _logged_truth(slam: Slam, log: Log, size: int) -> tuple[dict[str, Array], LandmarkPlaces]:
     to_map = truth_to_map(slam, log, size)
     until, out = slam.t_ns or 0, {}
     for name in log.truth.keys() & slam.robots.keys():

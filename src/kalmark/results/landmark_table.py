@@ -21,7 +21,6 @@ import csv
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations_with_replacement
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -34,6 +33,10 @@ from kalmark.errors import KalmarkError, RunError
 from kalmark.events import Id
 from kalmark.files import csv_text
 from kalmark.geometry.spaces import SCALAR, SE3, VECTOR, VECTOR3
+from kalmark.logs.known_map import cov_names, errors_of, from_triangle
+from kalmark.logs.native import LANDMARK3
+from kalmark.logs.native import WALL as WALL_COLUMNS
+from kalmark.logs.table_columns import POSE3, POSITION
 from kalmark.models.landmarks import Point2D, PointHeight2D, Wall2D
 from kalmark.models.protocols import Landmark, Segmented, place_of
 from kalmark.results.gauge import Datum, generators
@@ -49,13 +52,9 @@ TINY = 1e-30
 EUCLIDEANS, OTHERS, LINES = range(3)  # groups of what is drawn alike
 # kinds whose state is their place; others (inverse depth, for example) are not well known yet
 EUCLIDEAN = ("", "point", "point3", "point_signature", "point_height", "tag")
-_POINT = ("x_m", "y_m", "z_m")
-_PLANE = {"point_signature": (*_POINT[:2], "signature"), "point_height": _POINT, "wall": ("x_m", "y_m", "x2_m", "y2_m")}
-_LINE = (*_POINT, "x2_m", "y2_m", "z2_m")
-_TAG = (*_POINT, "qx", "qy", "qz", "qw")
-_PLACES = (*_LINE, *_TAG[3:], "signature")
-_SPACE = {POINT: _POINT, LINE: _LINE, TAG: _TAG}
-_ERRORS = (*_LINE, "rx_rad", "ry_rad", "rz_rad", "signature")  # in the order of their columns
+_PLANE = {"point_signature": (*POSITION[:2], "signature"), "point_height": POSITION, "wall": WALL_COLUMNS}
+_PLACES = (*LANDMARK3, "signature")
+_SPACE = {POINT: POSITION, LINE: LANDMARK3[:6], TAG: POSE3}
 
 
 def places(
@@ -124,10 +123,10 @@ def _ends(places: Array, d: int) -> Array:
     return places.reshape(len(places), 2, d) if places.shape[1] == 2 * d else places[:, None, :d]
 
 
-def _across(ends: Array) -> Array:
-    """Return the projections (2, d, d) across the line through two ends (2, d)."""
+def across_line(ends: Array) -> Array:
+    """Return the projection (d, d) across the line through two ends (2, d)."""
     u = ends[1] - ends[0]
-    return np.tile(np.eye(len(u)) - np.outer(u, u) / max(float(u @ u), TINY), (2, 1, 1))
+    return np.eye(len(u)) - np.outer(u, u) / max(float(u @ u), TINY)
 
 
 def _motions(places: Array, d: int, size: int, origin: Array) -> Array:
@@ -235,7 +234,7 @@ class MapLandmarks:
         ends, names = [_ends(self.means[k][None], d)[0] for k in some], [self.ids[k] for k in some]
         to_place = {k: _place_jacobian(slam, self.ids[k]) for k in order.tolist()}
         J = block_diagonal([to_place[k][: e.size] for k, e in zip(some, ends, strict=True)])
-        across = np.concatenate([_across(e) if len(e) > 1 else np.eye(d)[None] for e in ends])
+        across = np.concatenate([[across_line(e) if len(e) > 1 else np.eye(d)] * len(e) for e in ends])
         datum = Datum.of(np.concatenate(ends), across, J @ slam.covariance(*names) @ J.T, points[exact])
         onto = (datum.T @ J).T
         X = {name: C @ onto for name, C in _crosses(slam, [*robots, *(self.ids[k] for k in to_place)], names)}
@@ -292,10 +291,10 @@ class MapLandmarks:
         `log_odds` that they exist, and `mark` is "not seen again" of those that were not where they should be.
         """
         rows = [self._cells(k) for k in range(len(self))]
-        usual = _POINT if self.in_space else _POINT[:2]
-        used = dict.fromkeys(name for row in rows for name in row) or dict.fromkeys((*usual, *_cov_names(usual)))
+        usual = POSITION if self.in_space else POSITION[:2]
+        used = dict.fromkeys(name for row in rows for name in row) or dict.fromkeys((*usual, *cov_names(usual)))
         header = ["id", "kind", *(name for name in used if name in _PLACES)]
-        header += [*(name for name in _cov_names(_ERRORS) if name in used), "observations"]
+        header += [*(name for name in cov_names(_PLACES) if name in used), "observations"]
         header += ["class", "class_p"] * bool(self.classes) + ["known"] * bool(self.exact)
         header += ["log_odds", "mark"] * bool(self.log_odds)
         return csv_text(header, ([row.get(name, "") for name in header] for row in rows))
@@ -303,11 +302,10 @@ class MapLandmarks:
     def _cells(self, k: int) -> dict[str, Any]:
         """Return the cells of a row by column."""
         name, kind, mean, P = self.ids[k], self.kinds[k], self.means[k], self.covariances[k]
-        axes = _SPACE.get(len(mean), _POINT) if self.in_space else _PLANE.get(kind, _POINT)[: len(mean)]
-        errors = _errors(axes)
+        axes = _SPACE.get(len(mean), POSITION) if self.in_space else _PLANE.get(kind, POSITION)[: len(mean)]
         cells: dict[str, Any] = {"id": name, "kind": kind, "observations": self.observations[k]}
         cells |= zip(axes, mean.tolist(), strict=False)
-        cells |= zip(_cov_names(errors), P[np.triu_indices(len(errors))].tolist(), strict=True)
+        cells |= zip(cov_names(axes), P[np.triu_indices(len(errors_of(axes)))].tolist(), strict=True)
         cells |= zip(("class", "class_p"), self.classes.get(name, ()), strict=False)
         cells |= {"known": "exactly"} if name in self.exact else {}
         cells |= {"log_odds": float(self.log_odds[name])} if name in self.log_odds else {}
@@ -324,9 +322,7 @@ class MapLandmarks:
             for number, row in enumerate(rows, start=2):
                 try:
                     names = [name for name in _PLACES if row.get(name)]
-                    errors = _errors(names)
-                    cov, (i, j) = np.empty((len(errors),) * 2), np.triu_indices(len(errors))
-                    cov[i, j] = cov[j, i] = [float(row[name]) for name in _cov_names(errors)]
+                    cov = from_triangle([float(row[name]) for name in cov_names(names)])
                     table.ids.append(as_id(row["id"]))
                     table.kinds.append(row["kind"])
                     plane |= row["kind"] == PointHeight2D.kind or not row.get("z_m")
@@ -356,15 +352,3 @@ def refuse_other_than_points(slam: Slam, what: str, *, walls: bool = False) -> N
         odd = not is_own(type(track.model)) and (first not in (VECTOR, VECTOR3) or {*others} - {SCALAR})
         if odd or isinstance(track.model, Wall2D):
             raise KalmarkError(f"{what}: landmark {track.id!r} is a {track.model.kind}, expected points")
-
-
-def _errors(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of the components of the error of what has these columns: a quaternion's is a rotation."""
-    turn = ("rx_rad", "ry_rad", "rz_rad") if "qw" in names else ()
-    return (*(name for name in names if not name.startswith("q")), *turn)
-
-
-def _cov_names(errors: Sequence[str]) -> list[str]:
-    """Return the columns of the upper triangle of the covariance of an error, row by row."""
-    letters = [name[0] if name == "signature" else name.partition("_")[0] for name in errors]
-    return ["cov_" + "".join(pair) for pair in combinations_with_replacement(letters, 2)]

@@ -138,6 +138,12 @@ def sigmas(P: Array) -> Array:
     return out
 
 
+def correlations_of(P: Array) -> Array:
+    """Return the correlations (n, n) of a covariance (n, n), at most 1 in magnitude."""
+    sigma = np.sqrt(np.maximum(np.diagonal(P), TINY))
+    return np.clip(P / np.outer(sigma, sigma), -1.0, 1.0)
+
+
 def place_sigma(P: Array, d: int) -> Array:
     """Return the sigma (...) of a coordinate, on average, of covariances (..., n, n) that begin with a place (d,)."""
     out: Array = np.sqrt(np.maximum(np.trace(P[..., :d, :d], axis1=-2, axis2=-1) / d, 0.0))

@@ -36,10 +36,9 @@ from kalmark.results.truth import Truth
 from kalmark.slam.description import plain_value
 
 if TYPE_CHECKING:
-    from kalmark.logs.log import Log
+    from kalmark.logs.log import Log, Section
     from kalmark.slam.slam import Slam
 
-Section = dict[str, Any]  # of a configuration
 ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
 CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
 FAST, PAYS = 1, 0.75  # the level of compression of ``history.npz``, and what it must leave at most to be used

@@ -91,8 +91,9 @@ _HINTS = {
 }
 
 
-def _items(lines: Iterable[str]) -> str:
-    return "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+def tagged(tag: str, texts: Iterable[Any]) -> str:
+    """Return texts side by side, each as an element of a page."""
+    return "".join(f"<{tag}>{html.escape(str(text))}</{tag}>" for text in texts)
 
 
 def report_html(run: Recording, world: bool = False) -> str:
@@ -109,13 +110,13 @@ def report_html(run: Recording, world: bool = False) -> str:
     return read_page("report.html").format(
         title=html.escape(title),
         style=read_page("report.css"),
-        figures=spans(figures),
+        figures=tagged("span", figures),
         robots=robot_table(summary),
         summary=summary_table(summary),
         map="" if verdict is None else overall(verdict),
-        verdict=_items([] if verdict is None else verdict_lines(verdict)),
-        warnings=_items(summary.get("warnings", ())),
-        advice=_items(notes),
+        verdict=tagged("li", [] if verdict is None else verdict_lines(verdict)),
+        warnings=tagged("li", summary.get("warnings", ())),
+        advice=tagged("li", notes),
         mounts=_section("Mounts that calibrate themselves", mount_rows(summary), MOUNT_COLUMNS)
         + _section(DIFFERENCE_TITLE, difference_rows(summary), DIFFERENCE_COLUMNS),
         reasons=html_table(common_reasons(run), ("outcome", "reason", "observations")),
@@ -173,18 +174,12 @@ def figure_text(value: Any, unit: str = "") -> str:
     return str(value)
 
 
-def spans(texts: Iterable[str]) -> str:
-    """Return texts side by side."""
-    return "".join(f"<span>{html.escape(text)}</span>" for text in texts)
-
-
 def html_table(rows: Sequence[Sequence[Any]], head: Sequence[str]) -> str:
     """Return a table with a head, nothing without rows."""
     if not rows:
         return ""
-    top = "<tr>" + "".join(f"<th>{html.escape(cell)}</th>" for cell in head) + "</tr>"
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table>{top}{body}</table>"
+    body = "".join(f"<tr>{tagged('td', row)}</tr>" for row in rows)
+    return f"<table><tr>{tagged('th', head)}</tr>{body}</table>"
 
 
 def _section(title: str, rows: list[Any], head: tuple[str, ...]) -> str:

@@ -11,7 +11,7 @@ image.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.events import Id
 from kalmark.geometry.gaussian import contours, is_finite
 from kalmark.geometry.rotations import matrix
+from kalmark.logs.log import LandmarkPlaces
 from kalmark.picture_options import USUAL, Picture
 from kalmark.report import Report
 from kalmark.results.control_gaps import while_lost
@@ -122,7 +123,7 @@ class Scene:
 
     d: int
     ways: dict[str, Way]
-    true_landmarks: dict[Id, Array]
+    true_landmarks: LandmarkPlaces
     ids: tuple[Id, ...]
     shapes: Shapes
     cameras: tuple[Camera, ...]
@@ -254,7 +255,7 @@ class Scene:
         """Return the true lines (2, d)."""
         return [l.reshape(2, self.d) for l in self.true_landmarks.values() if len(l) == 2 * self.d]
 
-    def true_points(self) -> dict[Id, Array]:
+    def true_points(self) -> LandmarkPlaces:
         """Return the true positions (d,) of landmarks, without lines."""
         return {i: l[: self.d] for i, l in self.true_landmarks.items() if len(l) != 2 * self.d}
 
@@ -426,16 +427,15 @@ class Image(NamedTuple):
 
 def images(history: History, camera: Camera, step: int) -> list[Image]:
     """Return the images of the scan that a camera made at a step."""
-    points = _points(camera)
-    found = [Image(SIDES[side], []) for side in points]
+    seen: list[Any] = []
     for row in np.flatnonzero(history.step == step):
         name, outcome = str(history.landmark[row]) or str(history.id[row]), str(history.outcome[row])
         named = name, outcome, str(history.kind[row]) in EUCLIDEAN
-        _add_sighting(found, points, named, history.e[row], history.Z[row], (history.y[row], history.z[row]))
+        seen.append((named, history.e[row], history.Z[row], history.y[row], history.z[row]))
     for row in np.flatnonzero((history.unmeasured_step == step) & (history.unmeasured_sensor == camera.sensor)):
         named = str(history.unmeasured_landmark[row]), IN_VIEW, str(history.unmeasured_kind[row]) in EUCLIDEAN
-        _add_sighting(found, points, named, history.unmeasured_e[row], history.unmeasured_Z[row])
-    return found
+        seen.append((named, history.unmeasured_e[row], history.unmeasured_Z[row]))
+    return _images(camera, seen)
 
 
 def sides_of(camera: Camera) -> list[str]:
@@ -445,27 +445,27 @@ def sides_of(camera: Camera) -> list[str]:
 
 def images_of_report(camera: Camera, report: Report, kinds: Sequence[str]) -> list[Image]:
     """Return the images of a scan that a camera made; `kinds` are those of the landmarks of its observations."""
-    points = _points(camera)
-    found = [Image(SIDES[side], []) for side in points]
+    seen = []
     for o, kind in zip(report.observations, kinds, strict=True):
         name, k = next((str(each) for each in (o.landmark, o.id) if each is not None), ""), o.index
-        named = name, o.outcome, kind in EUCLIDEAN
-        _add_sighting(found, points, named, report.e[k], report.Z[k], (report.y[k], report.z[k]))
-    return found
+        seen.append(((name, o.outcome, kind in EUCLIDEAN), report.e[k], report.Z[k], report.y[k], report.z[k]))
+    return _images(camera, seen)
 
 
-def _add_sighting(
-    found: list[Image], points: Mapping[str, Ints], named: tuple[str, str, bool], e: Array, Z: Array,
-    measured: tuple[Array, Array] | None = None,
-) -> None:  # fmt: skip
-    """Add what was expected, e and Z, to its images, and what was `measured`: y and z.
+def _images(camera: Camera, seen: Iterable[tuple[Any, ...]]) -> list[Image]:
+    """Return the images of a camera in which each was seen: names of it, e and Z, and y and z if it was measured.
 
-    It is `named` by its name, its outcome and whether it is Euclidean.
+    The names are its own, its outcome, and whether it is Euclidean.
     """
-    whole = measured is None or len({np.isfinite(numbers).sum() for numbers in measured}) == 1
-    for image, at in zip(found, points.values(), strict=True):
-        Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
-        image.sightings.append(Sighting(*named, np.empty((0, 2)) if measured is None else measured[0][at], e[at], Z_at))
+    points = _points(camera)
+    found = [Image(SIDES[side], []) for side in points]
+    for (name, outcome, euclidean), e, Z, *measured in seen:
+        whole = len({np.isfinite(numbers).sum() for numbers in measured}) < 2
+        for image, at in zip(found, points.values(), strict=True):
+            Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
+            y_at = measured[0][at] if measured else np.empty((0, 2))
+            image.sightings.append(Sighting(name, outcome, euclidean, y_at, e[at], Z_at))
+    return found
 
 
 def colour_of(sighting: Sighting, picture: Picture) -> tuple[str, str]:

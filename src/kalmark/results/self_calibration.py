@@ -16,10 +16,10 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import unit_of
 from kalmark.geometry.named_poses import describe_pose
+from kalmark.logs.log import Section
 from kalmark.results.figure_texts import Figures, Summary, figure
 from kalmark.results.history import Biased, CalibratedMount
 from kalmark.results.measures import sigmas
-from kalmark.results.recording import Section
 
 AXES = {3: ("x", "y", "theta"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 UNITS = {"x": "m", "y": "m", "z": "m", "offset": "m"} | dict.fromkeys(("theta", "roll", "pitch", "yaw"), "deg")

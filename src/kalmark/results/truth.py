@@ -13,7 +13,7 @@ from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import from_matrix, matrix
-from kalmark.logs.log import Log, PositionTrack, poses_of_size
+from kalmark.logs.log import LandmarkPlaces, Log, PositionTrack, poses_of_size
 from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, ints, padded_all, texts
 from kalmark.results.landmark_table import TAG
 from kalmark.results.measures import Rigid, pose_error, sigmas
@@ -33,7 +33,7 @@ class Truth:
     """
 
     poses: Array
-    landmarks: dict[Id, Array] = field(default_factory=dict)
+    landmarks: LandmarkPlaces = field(default_factory=dict)
     fixes: dict[str, PositionTrack] = field(default_factory=dict)
     offset: Array = field(default_factory=lambda: ORIGIN[3])
     anchored: bool = False
@@ -68,7 +68,7 @@ class Truth:
         """Return the true poses (S, 3 or 7) in the frame of the map."""
         return self.to_map().poses(self.poses)
 
-    def landmarks_in_map(self) -> dict[Id, Array]:
+    def landmarks_in_map(self) -> LandmarkPlaces:
         """Return the true landmarks in the frame of the map."""
         return move_landmarks(self.to_map(), self.landmarks)
 
@@ -105,7 +105,7 @@ class Truth:
         return cls(named["truth"], landmarks, fixes, named["truth_offset"], bool(named["truth_anchored"]), robots)
 
 
-def landmarks_of_size(landmarks: Mapping[Id, Any], size: int) -> dict[Id, Array]:
+def landmarks_of_size(landmarks: Mapping[Id, Any], size: int) -> LandmarkPlaces:
     """Return true landmarks as they are among robots of the plane (size 3), or of space (size 7: points at z = 0)."""
     arrays = {i: np.asarray(l, dtype=np.float64) for i, l in landmarks.items()}
     return {i: np.append(l, 0.0) if size == 7 and len(l) == 2 else l for i, l in arrays.items()}
@@ -119,7 +119,7 @@ def as_rigid(pose: Array) -> Rigid:
     return Rigid(np.array([[c, -s], [s, c]]), pose[:2])
 
 
-def move_landmarks(rigid: Rigid, landmarks: Mapping[Id, Array]) -> dict[Id, Array]:
+def move_landmarks(rigid: Rigid, landmarks: Mapping[Id, Array]) -> LandmarkPlaces:
     """Return landmarks rotated and shifted: positions (attributes are kept), endpoints (4|6,), in space poses (7,)."""
     d = len(rigid.shift)
     out = {}

@@ -28,6 +28,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.declare import class_of, registered_name
 from kalmark.geometry.gaussian import gate, quantile
+from kalmark.logs.log import Section
 from kalmark.models import sensors
 from kalmark.results.association_errors import LEAST, no_ids
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
@@ -35,7 +36,7 @@ from kalmark.results.control_gaps import gap_warnings
 from kalmark.results.figure_texts import Figures, Summary, count, figure
 from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix, grouped
 from kalmark.results.measures import associated_nis, nis, place_sigma, truncated_variance
-from kalmark.results.recording import Recording, Section
+from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_warnings
 from kalmark.results.restarts import restarts
 from kalmark.results.self_calibration import mount_warnings

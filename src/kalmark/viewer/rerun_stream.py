@@ -24,8 +24,8 @@ from kalmark.geometry.gaussian import contours, is_finite
 from kalmark.geometry.rotations import from_matrix
 from kalmark.logs.log import poses_of_size
 from kalmark.picture_options import Picture
-from kalmark.results.measures import anees_interval, sigmas
-from kalmark.results.plot import BEHIND, GROUPS, VIEWS
+from kalmark.results.measures import anees_interval, correlations_of, sigmas
+from kalmark.results.plot import BEHIND, GROUPS, Projection
 from kalmark.results.scene import (
     EXPECTED,
     INK,
@@ -289,9 +289,7 @@ class Stream:
         """Log a covariance (n, n) as an image of its correlations: blue -1, white 0, red 1."""
         from matplotlib import colormaps
 
-        sigma = np.sqrt(np.maximum(np.diagonal(P), 1e-300))
-        correlations = np.clip(P / np.outer(sigma, sigma), -1.0, 1.0)
-        pixels = colormaps["RdBu_r"](0.5 + 0.5 * correlations)[..., :3]
+        pixels = colormaps["RdBu_r"](0.5 + 0.5 * correlations_of(P))[..., :3]
         self.put("covariance", self.rr.Image((255 * pixels).astype(np.uint8)))
 
     def nis(self, value: float, dof: int) -> None:
@@ -326,9 +324,7 @@ def eye_of(scene: Scene) -> tuple[Array, Array, Array]:
     """Return the position of the eye, the point that it looks at, and the direction upwards, by the picture's view."""
     low, high = (xyz(corner[None])[0] for corner in (scene.low, scene.high))
     view = scene.picture.view if scene.d == 3 and scene.picture.view != "self" else "top" if scene.d == 2 else "normal"
-    elevation, azimuth = np.radians(VIEWS[view] if isinstance(view, str) else view)
-    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    up = np.cross(ahead, [-np.sin(azimuth), np.cos(azimuth), 0.0])
+    _, up, ahead = Projection.of(scene, view).axes
     middle = (low + high) / 2
     return middle + 0.9 * float(np.linalg.norm(high - low)) * ahead, middle, up
 

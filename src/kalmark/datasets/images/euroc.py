@@ -9,20 +9,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.datasets.images.rigs import MOTION, ROBOT, camera_log, camera_section
+from kalmark.config.data_sheets import data_sheet
+from kalmark.datasets.images.rigs import MOTION, ROBOT, camera_log, camera_section, files_by_time
 from kalmark.errors import LogError
 from kalmark.events import Control, Frame, short_text
 from kalmark.files import unpack_file
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.image_files import frames_of
-from kalmark.logs.log import Log, Times, Trajectory, interpolate
-from kalmark.logs.source import Format, Request, number_of_text, read_text, spelling_hint
+from kalmark.logs.log import Log, Names, Section, Times, Trajectory, interpolate
+from kalmark.logs.source import Format, Request, increasing_times, number_of_text, one_of, read_text
 from kalmark.logs.table_columns import INERTIAL, TWIST3
 from kalmark.models.motion import noise_densities
 
@@ -33,8 +34,6 @@ ADIS16448 = {  # the data sheet in EuRoC's imu0/sensor.yaml
     "accelerometer_noise_density_mps_per_sqrt_s": 2.0e-3,
     "accelerometer_random_walk_mps2_per_sqrt_s": 3.0e-3,
 }
-NAMES = dict(zip(("gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density",
-                  "accelerometer_random_walk"), ADIS16448, strict=True))  # fmt: skip
 DENSITIES = tuple(ADIS16448)[::2]  # not the walks
 SURE = {
     "sigma_rotation_deg": [1.0, 1.0, 0.0],
@@ -54,20 +53,19 @@ def find(path: Path) -> Path | None:
 def read(
     path: Path,
     request: Request,
-    cameras: Annotated[tuple[str, ...], "The cameras, by the names of their folders."] = ("cam0",),
+    cameras: Annotated[Names, "The cameras, by the names of their folders."] = ("cam0",),
     imu: Annotated[Literal["auto", "none"], "Let the inertial unit move the robot, if there is one."] = "auto",
 ) -> Log:
     """Return the log of these cameras.  Raises LogError."""
     there = sorted(folder.name for folder in path.glob("cam*") if (folder / "data.csv").is_file())
     for name in cameras:
         if name not in there:
-            raise LogError(
-                f"{path}: no camera {short_text(name)}, expected {', '.join(there)}{spelling_hint(str(name), there)}"
-            )
+            raise LogError(f"{path}: no camera {short_text(name)}, {one_of(there, name)}")
     frames: list[Frame] = []
-    sections: dict[str, Any] = {}
+    sections: Section = {}
     for name in cameras:
-        listed = image_list(path / name)
+        file = path / name / "data.csv"
+        listed = files_by_time(path / name / "data", file, lines_of(file), "ns")
         taken = frames_of(ROBOT, name, [*listed], [*listed.values()], request)
         calibration = read_calibration(path / name / "sensor.yaml")
         frames, sections[name] = [*frames, *taken], camera_section(taken, calibration)
@@ -88,7 +86,7 @@ def read(
     times, u = since[kept], readings.rows[kept]
     held = np.maximum(times, begin) if start is not None else times  # the first one, from the start on
     controls = [Control(t_ns=t, robot=ROBOT, u=one) for t, one in zip(held.tolist(), u, strict=True)]
-    motion: dict[str, Any] = {"type": "inertial"} | inertial_noise(path / "imu0" / "sensor.yaml")
+    motion: Section = {"type": "inertial"} | inertial_noise(path / "imu0" / "sensor.yaml")
     for key, density in zip(DENSITIES, noise_densities(np.asarray(times * 1e-9), u), strict=True):
         motion[key] = max(motion[key], density)
     return camera_log("euroc", path, request, [*frames, *controls], sections, motion, INERTIAL, name=name, truth=truth,
@@ -121,39 +119,18 @@ def csv_of(file: Path, columns: int) -> Table | None:
     """
     if not file.is_file() and not file.with_name(f"{file.name}.gz").is_file():
         return None
-    t_ns: list[int] = []
-    numbers: list[list[float]] = []
-    for line, cells in lines_of(file):
+    found: dict[int, list[float]] = {}
+    for line, t_ns, cells in increasing_times(file, lines_of(file), "ns"):
         try:
-            t, row = int(cells[0]), [number_of_text(cell) for cell in cells[1:]]
-            good = len(cells) == columns and not (t_ns and t <= t_ns[-1])
+            found[t_ns] = [number_of_text(cell) for cell in cells]
+            if len(cells) != columns - 1:
+                raise ValueError
         except ValueError:
-            good = False
-        if not good:
-            raise LogError(
-                f"{file}:{line}: {short_text(','.join(cells))}, expected {columns} cells: increasing times in ns, and "
-                "finite numbers"
-            )
-        t_ns.append(t)
-        numbers.append(row)
-    if not t_ns:
-        raise LogError(f"{file}:1: no rows of data, expected times in ns and numbers")
-    return Table(np.array(t_ns, dtype=np.int64), np.array(numbers))
-
-
-def image_list(folder: Path) -> dict[int, Path]:
-    """Return the images of a camera by their times (ns).  Raises LogError."""
-    found: dict[int, Path] = {}
-    for line, cells in lines_of(folder / "data.csv"):
-        if len(cells) != 2 or not cells[0].isdecimal() or (found and int(cells[0]) <= max(found)):
-            raise LogError(
-                f"{folder / 'data.csv'}:{line}: {short_text(','.join(cells))}, expected increasing times in ns, each "
-                "with a file"
-            )
-        found[int(cells[0])] = folder / "data" / cells[1]
+            row = short_text(",".join(cells))
+            raise LogError(f"{file}:{line}: {row}, expected {columns - 1} finite numbers after the time") from None
     if not found:
-        raise LogError(f"{folder / 'data.csv'}:1: no rows of data, expected times and files")
-    return found
+        raise LogError(f"{file}:1: no rows of data, expected times in ns and numbers")
+    return Table(np.array([*found], dtype=np.int64), np.array([*found.values()]))
 
 
 def true_states(path: Path) -> Table | None:
@@ -175,7 +152,7 @@ def true_states(path: Path) -> Table | None:
     return Table(table.t_ns, states)
 
 
-def start_section(states: Table, t_ns: int) -> dict[str, Any] | None:
+def start_section(states: Table, t_ns: int) -> Section | None:
     """Return the true state at a time (ns) as the section of a start, None if that is outside the true states."""
     after = int(np.searchsorted(states.t_ns, t_ns))
     if t_ns < states.t_ns[0] or after == len(states.t_ns):
@@ -190,16 +167,8 @@ def start_section(states: Table, t_ns: int) -> dict[str, Any] | None:
 
 
 def inertial_noise(file: Path) -> dict[str, float]:
-    """Return the noise of the inertial unit: of its sensor.yaml, without one that of EuRoC's.  Raises LogError."""
-    from kalmark.logs.source import read_mapping
-
-    if not file.is_file():
-        return dict(ADIS16448)
-    content = read_mapping(file)
-    try:
-        return {own: float(content[name]) for name, own in NAMES.items()}
-    except (KeyError, TypeError, ValueError) as error:
-        raise LogError(f"{file}: {error}, expected numbers for {', '.join(NAMES)}") from None
+    """Return the noise of the inertial unit: of its sensor.yaml, without one that of EuRoC's.  Raises ConfigError."""
+    return data_sheet(file) if file.is_file() else dict(ADIS16448)
 
 
 EUROC = Format("euroc", "a folder mav0 with cam0/data.csv of EuRoC", find, read, describes_all=True)

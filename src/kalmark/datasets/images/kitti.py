@@ -7,7 +7,7 @@ the images of the right one, `image_1`, it is a rectified pair (`stereo`).  Of c
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from kalmark.datasets.images.rigs import CAMERA, ROBOT, camera_log, camera_secti
 from kalmark.errors import LogError
 from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.image_files import frames_of
-from kalmark.logs.log import Log, Trajectory
+from kalmark.logs.log import Log, Section, Trajectory
 from kalmark.logs.poses import kitti_rows
 from kalmark.logs.source import Format, Request, number_of_text, text_rows
 
@@ -60,7 +60,7 @@ def baseline(file: Path, left: str, right: str) -> float:
     return at[1] - at[0]
 
 
-def projection(file: Path, name: str) -> tuple[dict[str, Any], float]:
+def projection(file: Path, name: str) -> tuple[Section, float]:
     """Return the intrinsics of a camera's matrix (3, 4) in a file of KITTI, and its place along x [m].
 
     Raises LogError.

@@ -10,8 +10,8 @@ from kalmark.errors import LogError
 from kalmark.events import Event, Frame
 from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.image_files import image_size
-from kalmark.logs.log import Log
-from kalmark.logs.source import Request, one_robot
+from kalmark.logs.log import Log, Names, Section
+from kalmark.logs.source import Request, increasing_times, one_robot
 
 ROBOT, CAMERA = "robot", "camera"
 MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 1.0, "sigma_w_radps_per_sqrt_s": 2.0}
@@ -25,7 +25,7 @@ SEARCH = {
 CALIBRATIONS = ("calibration.yaml", "camera.yaml", "camera_info.yaml", "calibration.yml", "camera.yml", "config.yml")
 
 
-def camera_section(frames: Sequence[Frame], known: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def camera_section(frames: Sequence[Frame], known: Mapping[str, Any] | None = None) -> Section:
     """Return the section of a pin-hole camera: what is known of it, for images of the size of these.
 
     A calibration for images of another size is scaled: the centre of the first pixel is 0.
@@ -39,7 +39,7 @@ def camera_section(frames: Sequence[Frame], known: Mapping[str, Any] | None = No
     return {"type": "pinhole"} | found | size | SEARCH
 
 
-def calibration_beside(folder: Path) -> dict[str, Any]:
+def calibration_beside(folder: Path) -> Section:
     """Return the calibration in a folder, by the file names that programs give it, {} if there is none.
 
     Raises LogError if it cannot be read.
@@ -54,15 +54,32 @@ def calibration_beside(folder: Path) -> dict[str, Any]:
 
 def camera_log(
     format: str, path: Path, request: Request, events: Iterable[Event], sensors: Mapping[str, Any],
-    motion: Mapping[str, Any] = MOTION, controls: tuple[str, ...] = (), **rest: Any,
+    motion: Mapping[str, Any] = MOTION, controls: Names = (), **rest: Any,
 ) -> Log:  # fmt: skip
     """Return the log of a robot with cameras, `sensors` by name, whose frames are among the events."""
     start = rest.pop("start", START)
     robot = {"motion": dict(motion), "start": dict(start), "sensors": dict(sensors)}
-    rig: dict[str, Any] = {"robots": {ROBOT: robot}, "map": {"type": "dense"}}  # most landmarks are in view
+    rig: Section = {"robots": {ROBOT: robot}, "map": {"type": "dense"}}  # most landmarks are in view
     if motion is MOTION:
         rig["estimator"] = {"type": "ekf"}  # one linearisation: docs/vision.md
     return one_robot(format, path, request, ROBOT, events, controls, {}, describes=rig, **rest)
+
+
+def files_by_time(
+    folder: Path, file: Path, rows: Iterable[tuple[int, list[str]]] | None = None, unit: str = "s"
+) -> dict[int, Path]:
+    """Return files in a folder by their times (ns), which increase, of the rows of a file: a time and a name each.
+
+    Raises LogError.
+    """
+    found: dict[int, Path] = {}
+    for line, t_ns, names in increasing_times(file, rows, unit):
+        if len(names) != 1:
+            raise LogError(f"{file}:{line}: {len(names) + 1} cells, expected a time and a file")
+        found[t_ns] = folder / names[0]
+    if not found:
+        raise LogError(f"{file}:1: no rows of data, expected times and files")
+    return found
 
 
 def no_times(path: Path, what: str) -> LogError:

@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
-from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera_log, camera_section
+from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera_log, camera_section, files_by_time
 from kalmark.declare import Within
-from kalmark.errors import LogError
 from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.image_files import DEPTH_SCALE, frames_of
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, Section
 from kalmark.logs.poses import read_path
-from kalmark.logs.source import Format, Request, increasing_times
+from kalmark.logs.source import Format, Request
 
 NEAR_NS = 20_000_000
 SIZE = {"width_px": 640, "height_px": 480}
@@ -44,10 +43,10 @@ def read(
     depth_scale: Annotated[float, Within(ge=1e-3), "The number of 1 m in a depth image."] = DEPTH_SCALE,
 ) -> Log:
     """Return the log.  Raises LogError."""
-    listed = read_list(path / "rgb.txt")
+    listed = files_by_time(path, path / "rgb.txt")
     depths: dict[int, Path] = {}
     if depth == "auto" and (path / "depth.txt").is_file():
-        depths = match_times([*listed], read_list(path / "depth.txt"))
+        depths = match_times([*listed], files_by_time(path, path / "depth.txt"))
     frames = frames_of(ROBOT, CAMERA, [*listed], [*listed.values()], request, [*map(depths.get, listed)], depth_scale)
     poses = path / "groundtruth.txt"
     truth = {ROBOT: read_path(poses, request)} if poses.is_file() else {}
@@ -57,25 +56,13 @@ def read(
     return camera_log("tum_rgbd", path, request, frames, {CAMERA: section}, name=path.name, truth=truth)
 
 
-def published_calibration(name: str) -> dict[str, Any]:
+def published_calibration(name: str) -> Section:
     """Return the published calibration of a sequence by its name, {} if the name does not have the camera."""
     series = _SERIES.search(name)
     if series is None:
         return {}
     k, d = PUBLISHED[series[1]]
     return dict(zip(INTRINSICS, k, strict=True)) | SIZE | {"lens": "radtan", "distortion": [*d]}
-
-
-def read_list(file: Path) -> dict[int, Path]:
-    """Return files by their times (ns), which increase, of rows `t_s file`.  Raises LogError."""
-    found: dict[int, Path] = {}
-    for line, t_ns, names in increasing_times(file):
-        if len(names) != 1:
-            raise LogError(f"{file}:{line}: {len(names) + 1} cells, expected a time and a file")
-        found[t_ns] = file.parent / names[0]
-    if not found:
-        raise LogError(f"{file}:1: no rows of data, expected times and files")
-    return found
 
 
 def match_times(t_ns: list[int], others: dict[int, Path]) -> dict[int, Path]:
