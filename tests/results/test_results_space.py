@@ -145,6 +145,7 @@ def pretended(models: list[Any], means: list[Any], covariances: list[Any]) -> An
         segment_ends=ends.get,
         robots={"r": space},
         is_known=lambda name: False,
+        classes=lambda name: {},
     )
 
 

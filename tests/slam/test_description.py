@@ -47,15 +47,16 @@ AT_3D = (0.1, -0.2, 0.3, *from_euler(np.array([0.3, -0.4, 2.0]))[0])
 def values(own: Parameter) -> Iterator[Any]:
     """Yield values that a parameter may have and that are not its default."""
     numbers = (0.25, 0.75, 1.5, 3.0, 7.0, 20.0) if own.type is float else (1, 2, 3, 5, 9)
-    one = own.default if isinstance(own.default, tuple) else ()
+    texts = get_args(own.type)[:1] == (str,)
+    one = own.default if isinstance(own.default, tuple) and not texts else ()
     several = [tuple(v + step for v in one) for step in (1, 0.125)] + [(0.125, 0.25), (0.125,) * 4]
     for value in (None, *own.words, False, True, *numbers, *several):
         if value != own.default and type(value) is not type(own.default is None) and not own.refused(value):
             yield value
     if own.type is bool:
         yield not own.default
-    if get_args(own.type)[:1] == (str,):
-        yield ("blue", "yellow")
+    if texts:
+        yield ("red", "green")
     if own.name == "confusion":
         yield (0.75, 0.25, 0.125, 0.875)
 

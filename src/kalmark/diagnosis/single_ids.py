@@ -219,7 +219,7 @@ def _renamed(log: Log, run: Run, rows: Ints, name: Callable[[str], str]) -> list
             return e
         mine = [(e.t_ns, e.robot, e.sensor, k) in keys for k in range(len(e.ids))]
         ids = [name(str(i)) if other else i for i, other in zip(e.ids, mine, strict=True)]
-        return replace(e, ids=ids) if any(mine) else e
+        return replace(e, ids=tuple(ids)) if any(mine) else e
 
     return [*map(renamed_event, log.events)]
 

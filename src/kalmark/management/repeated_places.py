@@ -354,6 +354,9 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     if np.median(pairs[:, 0]) > np.median(pairs[:, 1]):  # the order of landmarks is that of their age
         pairs = pairs[:, ::-1]
     T = align_points(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(k))
+    back = np.linalg.norm(from_frame(T, look.places[pairs[:, 1]])[0] - look.places[pairs[:, 0]], axis=1)
+    if np.median(back) <= look.spacing / 2:  # each part is the other one turned: the world is symmetric
+        return None
     score, fits, agrees = _weighed(look, T, pairs, density)
     score += MISSED * found.missing
     rivals = any(

@@ -71,7 +71,7 @@ class Mount:
     and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
     by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
     called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas, and `lag_s`,
-    the time by which the stamps of its scans are late, if that has (docs/time.md).  `robust` makes outliers count less,
+    the time by which the stamps of its scans are late, if that has (docs/race_track.md).  `robust` makes outliers count less,
     "huber" or "student" (docs/association.md; None: all count in full).  `classes` are those that the sensor reports of
     landmarks.
 

@@ -28,7 +28,7 @@ class Classes:
            [0.1, 0.9]])
     """
 
-    names: Annotated[tuple[str, ...], "The classes, as the observations name them."] = ()
+    names: Annotated[tuple[str, ...], "The classes, as the observations name them."] = ("blue", "yellow")
     error: Annotated[Probability, "Probability that another class is reported than the true one."] = 0.05
     confusion: Annotated[
         tuple[float, ...] | None,
