@@ -69,7 +69,7 @@ class Kernels(Way):
         kernels.predict(m.P, m.n, self.index, F, G @ self.N @ G.T)
         slots = np.array([self.slam.slot(i) for i in scan.ids or ()])
         seen = (0, -1, slots, 2, scan.y, self.noise, np.inf)
-        corrections.compiled_invariant(self.model, m.whole, seen, (6, 1e-3))
+        corrections.invariant(self.model, m.whole, seen, (6, 1e-3))
 
 
 class Isam2Pose(Isam2):
@@ -145,13 +145,13 @@ def parts(steps: int) -> dict[str, float]:
 
         return run
 
-    predict, correct, spent = prediction.compiled_predicted, Invariant.compiled, []
+    predict, correct, spent = prediction.predict, Invariant.compiled, []
     for control, scan in field.circle(2 * steps, view=IN_VIEW):
         if len(spent) == steps:  # of what is timed with its kernels nothing else counts
-            prediction.compiled_predicted = timed("prediction", predict)
+            prediction.predict = timed("prediction", predict)
             Invariant.compiled = staticmethod(timed("correction", correct))  # type: ignore[assignment]
         spent.append((spent_us(slam.process, control), spent_us(slam.process, scan)))
-    prediction.compiled_predicted = predict
+    prediction.predict = predict
     Invariant.compiled = staticmethod(correct)  # type: ignore[assignment]
     control_us, scan_us = np.median(spent[steps // 2 : steps], axis=0)
     found = {f"{name}_us": float(np.median(values)) for name, values in kernels_us.items()}

@@ -16,7 +16,7 @@ import pytest
 
 from kalmark import compiled
 from kalmark.compiled import _CheckedFiles, address_of, by_address, signature_of
-from kalmark.filter.corrections import compile_correction, compiled_textbook
+from kalmark.filter.corrections import compile_correction, textbook
 
 SUM = signature_of("f8(f8[::1])")
 call = by_address(SUM)
@@ -80,7 +80,7 @@ def test_what_is_compiled_ahead_is_asked_for_once_in_a_cache_and_waited_for(
     assert waited == [True]
     compiled.work_ahead(text, mark)
     begin()
-    assert len(asked) == 1 and compiled_textbook.overloads
+    assert len(asked) == 1 and textbook.overloads
 
 
 def test_a_job_that_fails_is_not_taken_for_done(tmp_path: Path) -> None:

@@ -139,6 +139,11 @@ def python_form(function: F) -> F:
     return python
 
 
+def form_for(model: Any, function: F) -> F:
+    """Return a compiled function for a compiled model, which is a tuple, and its Python form for a user's."""
+    return function if isinstance(model, tuple) else python_form(function)
+
+
 class _Folder(UserProvidedCacheLocator):  # type: ignore[misc, unused-ignore]
     """The folder of the cache, also where nothing can be written into it: then it is only read."""
 

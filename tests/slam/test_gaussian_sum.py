@@ -188,7 +188,7 @@ def test_a_sum_is_kept_when_a_map_is_saved(tmp_path: Path) -> None:
     one, other = (hall.slam(MIDDLE, ANYWHERE) for hall in (whole, resumed))
     whole.drive(one, 0.7)
     resumed.drive(other, 0.7)
-    assert len(other.state.sums["r"].parts) > 1
+    assert len(other.state.sums["r"].parts.P) > 1
     other.save(tmp_path / "map.kmk")
     other = km.Slam.load(tmp_path / "map.kmk")
     whole.drive(one, 2.0)
@@ -218,7 +218,7 @@ def test_a_range_at_the_middle_of_a_robot_needs_no_heading_and_one_beside_it_doe
     for at in (0.0, 0.5):
         mount = km.Mount(km.sensors.Range(RANGE_M), at=(at, 0.0, 0.0))
         channel = km.Slam(km.Robot("r", km.motion.Unicycle(), sensors={"radio": mount})).state.channels["r", "radio"]
-        bent.append(bends(channel.models["point"].exactly.model, np.zeros(3), P, y, R).tolist())
+        bent += bends(channel.models["point"].exactly.model, np.zeros((1, 3)), P[None], y, R).tolist()
     assert bent == [[False, False, False], [True, False, False]]
 
 

@@ -24,13 +24,13 @@ def test_turns_hold_up_to_a_sigma_of_half_a_radian_about_any_axis() -> None:
 def test_the_squares_of_sigma_points_add_up_to_the_covariance() -> None:
     A = np.random.default_rng(0).normal(size=(3, 3))
     P = 0.05 * A @ A.T
-    steps = sigma_point_steps(P)
+    (steps,) = sigma_point_steps(P[None])
     np.testing.assert_allclose(steps.T @ steps, SIGMAS**2 * P, atol=1e-12)
     assert (steps[1:, 2] == 0.0).all(), "only the first one turns"
 
 
 def test_a_heading_that_is_unknown_is_looked_at_half_a_turn_away() -> None:
-    steps = sigma_point_steps(np.diag([4.0, 1.0, 2.0**2]))
+    (steps,) = sigma_point_steps(np.diag([4.0, 1.0, 2.0**2])[None])
     assert steps[0].tolist() == [0.0, 0.0, np.pi]
     np.testing.assert_allclose(np.abs(steps[1:]), [[0.0, 2.0, 0.0], [4.0, 0.0, 0.0]], atol=1e-12)
 
@@ -62,7 +62,7 @@ def test_an_observation_bends_along_the_axes_that_it_is_not_linear_in(
     v = POINT.seen_from(np.array([at_m, 0.0, 0.0]), l)[0]
     y = np.concatenate([sensor.expect(v)[0], l], axis=1)
     P, R = np.diag([1e-4, 1e-4, sigma_theta**2]), sensor.noise(sensor.expect(v)[0])
-    assert bends(model.model, ORIGIN, P, y, R).tolist() == bent
+    assert bends(model.model, ORIGIN[None], P[None], y, R).tolist() == [bent]
 
 
 def test_a_range_bends_over_a_position_that_is_known_worse_than_the_landmark_is_far() -> None:
@@ -70,4 +70,4 @@ def test_a_range_bends_over_a_position_that_is_known_worse_than_the_landmark_is_
     y = np.array([[1.0, *l[0]]])
     for sigma_m, bent in ((0.1, False), (2.0, True)):
         P = np.diag([sigma_m**2, sigma_m**2, 1e-6])
-        assert bends(model.model, ORIGIN, P, y, 0.01 * np.ones((1, 1, 1)))[1:].any() == bent
+        assert bends(model.model, ORIGIN[None], P[None], y, 0.01 * np.ones((1, 1, 1)))[0, 1:].any() == bent

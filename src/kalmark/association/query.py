@@ -9,6 +9,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.association.matchings import Places
 from kalmark.association.wall_segments import disjoint_from_walls
+from kalmark.compiled import form_for
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
 from kalmark.filter.layout import P_AT
@@ -249,7 +250,7 @@ class Candidates:
         m, robot, mount, here = self._read
         model, y = self._model, self._scan.y[rows]
         R = self._scan.noise_of(model, m.means(here[columns], model.d), rows)
-        run = corrections.compiled_fit if isinstance(model.model, tuple) else corrections.scan_fit
+        run = form_for(model.model, corrections.scan_fit)
         scan = robot, mount, here[columns], model.d, y, np.ascontiguousarray(R), np.inf
         d2, log_det = run(model.model, m.whole, scan, LIMITS)
         return float(d2 + self._of_classes[rows, columns].sum()), float(log_det)

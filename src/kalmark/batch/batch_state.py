@@ -5,19 +5,18 @@ Poses are (n, 3) in the plane or (n, 7) in space; their errors are position and 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
 from kalmark.arrays import Array, Index
-from kalmark.compiled import compiled, python_form
+from kalmark.compiled import compiled
 from kalmark.errors import KalmarkError
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import left_jacobian_inverse
 from kalmark.geometry.spaces import SE2, SE3, Space, Table, retract, retract_plane
-from kalmark.models.observe import linearize
 
 Ints = Index
 
@@ -83,15 +82,6 @@ def plus(space: Space, x: Array, d: Array, turns: Array) -> Array:
     return run(space.atoms, *(np.ascontiguousarray(a) for a in (x, d, turns)))
 
 
-def innovations_and_jacobians(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
-    """Return the innovations z (K, p) of y (K, m) and E (K, p, h + n) by the errors of head and landmark.  [S] (63).
-
-    Row for row a `head` (K, .), pose and mount as of `kalmark.models.observe`, observes a landmark l (K, .).
-    """
-    look = _looked if isinstance(view, tuple) else python_form(_looked)
-    return look(view, *(np.ascontiguousarray(a) for a in (head, l, y)))
-
-
 @compiled
 def _plus(atoms: Table, x: Array, d: Array, turns: Array) -> Array:
     moved = x.copy()
@@ -106,20 +96,6 @@ def _plus_in_plane(atoms: Table, x: Array, d: Array, turns: Array) -> Array:
     for i in range(len(x)):
         retract_plane(atoms, moved[i], d[i], turns[i])
     return moved
-
-
-@compiled
-def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
-    _, z_0, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
-    k, p, h, n = len(y), z_0.shape[1], H_0.shape[2], L_0.shape[2]
-    z, E = np.empty((k, p)), np.empty((k, p, h + n))
-    for i in range(k):  # element by element: numba compiles slices for a second more
-        _, z_i, H_i, L_i = linearize(view, head[i], l[i : i + 1], y[i : i + 1])
-        for a in range(p):
-            z[i, a] = z_i[0, a]
-            for c in range(h + n):
-                E[i, a, c] = H_i[0, a, c] if c < h else L_i[0, a, c - h]
-    return z, E
 
 
 def step_residuals(a: Array, b: Array, step: Array) -> tuple[Array, Array]:

@@ -21,13 +21,13 @@ from kalmark.batch.batch_state import (
     POSES,
     BatchState,
     Ints,
-    innovations_and_jacobians,
     plus,
     step_residuals,
 )
 from kalmark.events import Id
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.spaces import POINT2, POINT3, Space
+from kalmark.models.observe import innovations_and_jacobians
 
 DIFFERENCE = 1e-5  # m and rad
 

@@ -21,12 +21,12 @@ from scipy.spatial import cKDTree
 
 from kalmark.arrays import Array, Flags
 from kalmark.association.gated import assign
-from kalmark.batch.batch_state import LANDMARKS, Ints, innovations_and_jacobians
+from kalmark.batch.batch_state import LANDMARKS, Ints
 from kalmark.batch.data import BatchReplay
 from kalmark.batch.solver import Batch, optimum
 from kalmark.events import Id
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.models.observe import inverse_expectation, view_of
+from kalmark.models.observe import innovations_and_jacobians, inverse_expectation, view_of
 from kalmark.models.protocols import FullSensor
 
 GATE, NEW_GATE = 0.99, 0.99999  # as of the filter: an observation is of a landmark within one, of a new one beyond both

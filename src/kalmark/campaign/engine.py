@@ -139,7 +139,7 @@ def by_landmark(count: int, steps: Index, numbers: Index, places: Array, y: Arra
 @compiled
 def textbook(view: Any, map_: Any, scan: Any, limits: tuple[int, float]) -> Any:
     """Correct as `Ekf` does, with the arguments of `invariant`."""
-    return corrections.compiled_textbook(view, map_, scan, None)
+    return corrections.textbook(view, map_, scan, None)
 
 
 @compiled
@@ -276,9 +276,9 @@ class _Filter:
         ((key, mount),) = robot.sensors.items()
         channel, motion = slam.state.channels[name, key], robot.motion
         assert isinstance(motion, MOTIONS) and isinstance(mount.sensor, RangeBearing)
-        correct = corrections.compiled_invariant if isinstance(estimator, Invariant) else textbook
+        correct = corrections.invariant if isinstance(estimator, Invariant) else textbook
         self.ways = (
-            address_of(prediction.compiled_predicted, PREDICT), address_of(correct, CORRECT),
+            address_of(prediction.predict, PREDICT), address_of(correct, CORRECT),
             corrections.generator_address(1),
         )  # fmt: skip
         self.routines = corrections.routines(1, False, False)

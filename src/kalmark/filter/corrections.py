@@ -115,7 +115,7 @@ def routines(axes: int, inverse_depths: bool, dependent: bool) -> Routines:
 def compile_correction(name: str, option: str, axes: int, inverse_depths: bool, dependent: bool) -> None:
     """Compile one of the corrections below, whose last argument has the type `option`, and its routines."""
     address_of(compiled_iterate, ITERATE)
-    globals()[f"compiled_{name}"].compile(signature_of(f"none({TO_CORRECT}, {option})").args)
+    globals()[name].compile(signature_of(f"none({TO_CORRECT}, {option})").args)
     routines(axes, inverse_depths, dependent)
 
 
@@ -291,6 +291,7 @@ def product_left(E_r: Array, E_l: Array, rows: Array, at: int, V: Array, index: 
     return HP
 
 
+@compiled
 def invariant(
     model: Any, map_: Map, scan: Scan, limits: tuple[int, float]
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
@@ -354,6 +355,7 @@ def invariant(
     return e, z, Z, d2, near, valid
 
 
+@compiled
 def innovation_covariances(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
     """Return each observation's innovation covariance Z (K, p, p) and d2 (K,); nothing is corrected.  [S] (83)."""
     x, P, _n, blocks, atoms, _axes, _ways = map_
@@ -365,6 +367,7 @@ def innovation_covariances(model: Any, map_: Map, scan: Scan) -> tuple[Array, Ar
     return Z, d2
 
 
+@compiled
 def robust_noise(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     """Return R (K, p, p) divided by robust weights of what a scan leaves of each whitened innovation r.
 
@@ -407,6 +410,7 @@ def robust_noise(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     return inflated
 
 
+@compiled
 def scan_fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
     """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if not valid."""
     P, ways = map_[1], map_[6]
@@ -425,6 +429,7 @@ def scan_fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tu
     return (w * w).sum(), log_det
 
 
+@compiled
 def correct_by_average(
     model: Any, map_: Map, scan: Scan, limits: tuple[int, float], pairs: Index, weights: Array, transports: bool
 ) -> tuple[Array, bool]:
@@ -481,6 +486,7 @@ def correct_by_average(
     return d2, True
 
 
+@compiled
 def textbook(
     model: Any, map_: Map, scan: Scan, _: None
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
@@ -524,6 +530,7 @@ def textbook(
     return e, z, Z, d2, near, valid
 
 
+@compiled
 def first_estimates(
     model: Any, map_: Map, scan: Scan, x_first: Array
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
@@ -548,12 +555,3 @@ def first_estimates(
     downdate(P, V)
     call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
     return e, z, Z, d2, near, valid
-
-
-compiled_invariant = compiled(invariant)
-compiled_compared = compiled(innovation_covariances)
-compiled_weighed = compiled(robust_noise)
-compiled_fit = compiled(scan_fit)
-compiled_averaged = compiled(correct_by_average)
-compiled_textbook = compiled(textbook)
-compiled_first_estimates = compiled(first_estimates)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from kalmark.arrays import Array, Index
-from kalmark.compiled import compile_on_second_core
+from kalmark.compiled import compile_on_second_core, form_for, python_form
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
 from kalmark.filter.estimator_protocols import (
@@ -61,7 +61,6 @@ class _Estimator:
 
     coordinates: ClassVar[str] = "world"
     default_gate: ClassVar[float] = math.inf
-    source: ClassVar[Callable[..., Any]]
     compiled: ClassVar[Callable[..., Any]]
     option: ClassVar[str] = "none"  # the type of what `_option` returns
     from_first: ClassVar[bool] = False  # whether displacements count from the first estimates
@@ -71,13 +70,13 @@ class _Estimator:
         """Begin to compile the correction of a map of these axes on a second core."""
         job, cls = corrections.compile_correction, type(self)
         needs = axes, inverse_depths, dependent
-        compile_on_second_core(corrections.compiled_iterate, job, cls.source.__name__, cls.option, *needs)
+        compile_on_second_core(corrections.compiled_iterate, job, cls.compiled.__name__, cls.option, *needs)
 
     def predict(self, map_: Map, movement: Movement) -> bool:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
         model, robot, added, *control = movement
         m, robot, _, here = map_.movable(robot, added)
-        run: Any = prediction.compiled_predicted if isinstance(model, tuple) else prediction.predict
+        run: Any = prediction.predict if isinstance(model, tuple) else python_form(prediction.predict)
         where = m.x, m.x_first, m.P, m.n, m.blocks, m.atoms, corrections.generator_address(m.axes)
         return bool(run(where, (model, robot, here, *control), self.from_first, self.transports and m.axes == 6))
 
@@ -102,7 +101,7 @@ class _Estimator:
         return done
 
     def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan, parallax: bool) -> Correction:
-        run = type(self).compiled if isinstance(model, tuple) else type(self).source
+        run = type(self).compiled if isinstance(model, tuple) else python_form(type(self).compiled)
         whole = m.whole if parallax else (*m.whole[:-1], corrections.routines(m.axes, False, m.dependent))
         return Correction(*run(model, whole, scan, self._option(m)))
 
@@ -126,7 +125,7 @@ class _Estimator:
         Returns d2 (K,) of the pairs of the first one, and whether the covariances are valid.
         """
         model, *scan = update[:-1]
-        run: Any = corrections.compiled_averaged if isinstance(model, tuple) else corrections.correct_by_average
+        run: Any = form_for(model, corrections.correct_by_average)
         m, robot_here, _, _ = map_.opened(update.robot, update.mount, update.slots, self.transports)
         before = m.x.copy() if self.transports and has_units(m) else None
         d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)
@@ -162,8 +161,7 @@ class Ekf(_Estimator):
     """
 
     default_gate = 9.0
-    source = corrections.textbook
-    compiled = corrections.compiled_textbook
+    compiled = corrections.textbook
 
 
 @register("estimator", "invariant")
@@ -187,8 +185,7 @@ class Invariant(_Estimator):
     coordinates = "log"
     option = "Tuple((i8, f8))"
     transports = True
-    source = corrections.invariant
-    compiled = corrections.compiled_invariant
+    compiled = corrections.invariant
 
     def _limits(self) -> tuple[int, float]:
         return self.iterations, float(self.tolerance)
@@ -219,8 +216,7 @@ class Fej(_Estimator):
 
     option = "f8[::1]"
     from_first = True
-    source = corrections.first_estimates
-    compiled = corrections.compiled_first_estimates
+    compiled = corrections.first_estimates
 
     def _option(self, map_: StochasticMap) -> Array:
         return map_.x_first

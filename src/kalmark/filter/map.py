@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from copy import copy
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -155,6 +156,12 @@ class StochasticMap(Layout):
         m.x, m.P, m.blocks, m.atoms, m.n, m.x_n = x, P, blocks, atoms, len(P), len(x)
         m.axes, m.inverse_depths, m.dependent = axes, inverse_depths, dependent
         return m
+
+    def with_numbers(self, x: Array, x_first: Array, P: Array) -> StochasticMap:
+        """Return a map of the same blocks, which cannot grow, of the means and first estimates (n,) and P (n, n)."""
+        other = copy(self)
+        other.x, other.x_first, other.P, other._next = x, x_first, P, P
+        return other
 
     @property
     def whole(self) -> corrections.Map:

@@ -110,6 +110,7 @@ def write_mean(x: Array, x_first: Array, at: int, mean: Array) -> None:
         x[at + i] = x_first[at + i] = mean[i]
 
 
+@compiled
 def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     """Move a robot in a map; return whether all of it is finite: if not, nothing has changed.
 
@@ -151,6 +152,3 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     if begins:
         write_mean(x, x_first, blocks[added[0], 0], np.zeros(len(u)))
     return True
-
-
-compiled_predicted = compiled(predict)

@@ -29,7 +29,7 @@ from numba import types
 from numba.extending import overload
 
 from kalmark.arrays import Array, Flags
-from kalmark.compiled import address_of, by_address, compiled, signature_of
+from kalmark.compiled import address_of, by_address, compiled, form_for, signature_of
 from kalmark.declare import built_in
 from kalmark.geometry import frames3d
 from kalmark.geometry.angles import exponential_v, wrap
@@ -303,6 +303,29 @@ def _compiled_linearize(view: Any, head: Any, l: Any, y: Any) -> Any:
     if isinstance(view, types.BaseTuple):
         return lambda view, head, l, y: call_linearize(view[0], (view, head, l, y))
     return None
+
+
+def innovations_and_jacobians(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
+    """Return the innovations z (K, p) of y (K, m) and E (K, p, h + n) by the errors of head and landmark.  [S] (63).
+
+    Row for row a `head` (K, .), pose and mount, observes a landmark l (K, .).
+    """
+    look = form_for(view, _looked)
+    return look(view, *(np.ascontiguousarray(a) for a in (head, l, y)))
+
+
+@compiled
+def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
+    _, z_0, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
+    k, p, h, n = len(y), z_0.shape[1], H_0.shape[2], L_0.shape[2]
+    z, E = np.empty((k, p)), np.empty((k, p, h + n))
+    for i in range(k):  # element by element: numba compiles slices for a second more
+        _, z_i, H_i, L_i = linearize(view, head[i], l[i : i + 1], y[i : i + 1])
+        for a in range(p):
+            z[i, a] = z_i[0, a]
+            for c in range(h + n):
+                E[i, a, c] = H_i[0, a, c] if c < h else L_i[0, a, c - h]
+    return z, E
 
 
 def sensor_at(view: Any, head: Array, address: int) -> tuple[Array, Array]:

@@ -43,12 +43,11 @@ class Alternative:
     @classmethod
     def of(cls, map_: Map, moving: Moving, blocks: int, since_ns: int) -> Alternative:
         """Return the present state of the first so many blocks of a map, which are no landmarks."""
-        own, slots = StochasticMap(), range(blocks)
+        own = StochasticMap()
         for slot, space in enumerate(map_.spaces[:blocks]):
             assert space is not None
             own.add(space, map_.mean(slot))
-        rows = np.concatenate([own.index(slot) for slot in slots])
-        own.predict(rows, np.eye(len(rows)), map_.covariance(slots))
+        own.predict(np.arange(own.n), np.eye(own.n), map_.covariance(range(blocks)))
         return cls(own, motion_of_alternative(moving), since_ns)
 
     def widen(self, z: Array, Z: Array, R: Array) -> None:

@@ -15,22 +15,25 @@ began at an outlier, then others begin from it.  Each part is a filter of the ro
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags
+from kalmark.arrays import Array, Index
+from kalmark.errors import MapError
 from kalmark.filter.estimators import Correction, Estimator, Update
-from kalmark.filter.map import Map
+from kalmark.filter.map import NO_SLOTS, Map, StochasticMap
+from kalmark.filter.observed_block import squared_distances
 from kalmark.geometry.angles import rotation, wrap
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.geometry.spaces import Space
+from kalmark.geometry.spaces import ANGLE, HEADING
 from kalmark.models.observe import linearize
 from kalmark.slam.alternative import Alternative
 from kalmark.slam.held_control import MotionPart, Moving
-from kalmark.tracks.linearity import SIGMAS, bends, turn_holds, turn_pose
+from kalmark.tracks.linearity import SIGMAS, TURN_RAD, bends, turn_pose
 from kalmark.tracks.surveys import SURVEYED
 
 PIECES, PIECE_RAD = 12, 0.3  # of a circle of headings, and the sigma of each: they overlap to a sum that is even
@@ -44,6 +47,9 @@ ANYWHERE_M = 1e4  # sigma of a position that may be any
 IN_A_ROW = 5  # observations that do not fit the filter of a robot, or over which a sum is linear, decide
 
 
+NOWHERE = np.full(2, np.nan)
+
+
 class KnownObservation(NamedTuple):
     """An observation of a landmark known exactly at l (2,): `update` has one row; `gate` is that of its d2.
 
@@ -51,10 +57,10 @@ class KnownObservation(NamedTuple):
     """
 
     update: Update
-    l: Array
-    at: Array
     gate: float
-    is_distance: bool
+    l: Array = NOWHERE
+    at: Array = NOWHERE
+    is_distance: bool = False
 
     @property
     def floor(self) -> float:
@@ -67,24 +73,46 @@ class KnownObservation(NamedTuple):
         return -0.25 * self.gate - 0.5 * float(np.linalg.slogdet(self.update.R[0])[1])
 
 
-def log_likelihood(done: Correction, k: int, seen: KnownObservation) -> float:
-    """Return that of the k-th observation of a correction, at least that of an outlier."""
-    if not math.isfinite(done.d2[k]):
-        return seen.floor
-    return max(-0.5 * float(done.d2[k] + np.linalg.slogdet(done.Z[k])[1]), seen.floor)
+def log_likelihood(d2: Any, Z: Array, seen: KnownObservation) -> Any:
+    """Return those of innovations of squared distances d2 (M,), NaN of none, and covariances Z (M, p, p).
+
+    They are at least that of an outlier.
+    """
+    return np.fmax(-0.5 * (d2 + np.linalg.slogdet(Z)[1]), seen.floor)
+
+
+class Parts(NamedTuple):
+    """Gaussians of all blocks of a map of the plane: means and first estimates (M, n), lower triangles P (M, n, n)."""
+
+    x: Array
+    x_first: Array
+    P: Array
+    log_weights: Array
+
+    @classmethod
+    def joined(cls, several: Sequence[Parts]) -> Parts:
+        """Return several sums as one."""
+        return cls(*map(np.concatenate, zip(*several, strict=True)))
+
+    def take(self, rows: Any) -> Parts:
+        """Return some of them."""
+        return Parts(*(array[rows] for array in self))
+
+    def whole(self) -> Parts:
+        """Return them with both triangles of P."""
+        return self._replace(P=np.tril(self.P) + np.tril(self.P, -1).swapaxes(1, 2))
 
 
 @dataclass
 class GaussianSum:
-    """The parts of a robot's pose with their `log_weights` (M,), and the prior with its own.
+    """The parts of a robot's pose, and the prior with its own log weight.
 
     `lead` is the log of the odds of the filter that the map has of the robot, -inf where that is none of its own but
     shows the moments of the sum.  Over these the last `linear` observations were as good as linear.
     """
 
     prior: Alternative
-    parts: list[Alternative]
-    log_weights: Array
+    parts: Parts
     prior_log: float
     lead: float = -math.inf
     linear: int = 0
@@ -92,8 +120,8 @@ class GaussianSum:
     @classmethod
     def of(cls, map_: Map, moving: Moving, blocks: int, t_ns: int, gate: float) -> GaussianSum:
         """Return the Gaussian of a robot in a map with so many blocks that are no landmarks, as one part."""
-        first, second = (Alternative.of(map_, moving, blocks, t_ns) for _ in range(2))
-        return cls(first, [second], np.zeros(1), -0.25 * gate)
+        prior = Alternative.of(map_, moving, blocks, t_ns)
+        return cls(prior, as_part(prior.map, 0.0), -0.25 * gate)
 
     @classmethod
     def anywhere(cls, map_: Map, moving: Moving, blocks: int, t_ns: int, gate: float) -> GaussianSum:
@@ -101,7 +129,13 @@ class GaussianSum:
         prior = Alternative.of(map_, moving, blocks, t_ns)
         rows = prior.map.index(moving.slot)[:3]
         prior.map.predict(rows, np.zeros((3, 3)), np.diag([ANYWHERE_M, ANYWHERE_M, VAGUE_RAD]) ** 2)
-        return cls(prior, [], np.zeros(0), 0.0, 0.5 * IN_A_ROW * gate)
+        return cls(prior, as_part(prior.map, 0.0).take(slice(0)), 0.0, 0.5 * IN_A_ROW * gate)
+
+    def restored(self) -> None:
+        """Check the arrays of a file.  Raises MapError."""
+        m, n = len(self.parts.log_weights), self.map.n
+        if [array.shape for array in self.parts] != [(m, n), (m, n), (m, n, n), (m,)]:
+            raise MapError(f"the parts of a sum have the shapes {[array.shape for array in self.parts]}")
 
     @property
     def shows(self) -> bool:
@@ -111,12 +145,32 @@ class GaussianSum:
     @property
     def is_found(self) -> bool:
         """True if its parts explain what was observed better than that it may be any."""
-        return _log_sum(self.log_weights) > self.prior_log
+        return _log_sum(self.parts.log_weights) > self.prior_log
 
-    def all(self) -> Iterator[Alternative]:
-        """Yield the prior and the parts."""
-        yield self.prior
-        yield from self.parts
+    @cached_property
+    def map(self) -> StochasticMap:
+        """The map of the prior."""
+        return cast(StochasticMap, self.prior.map)
+
+    @cached_property
+    def angles(self) -> Index:
+        """The rows (A,) of the parts that are angles."""
+        atoms = self.map.atoms
+        return atoms[np.isin(atoms[:, 0], (HEADING, ANGLE)), 2]
+
+    @cached_property
+    def pose(self) -> slice:
+        """The rows of the robot's pose."""
+        first = int(self.map.rows(self.prior.moving.slot)[0])
+        return slice(first, first + 3)
+
+    def all(self) -> list[Alternative]:
+        """Return the prior and the parts."""
+        return [self.prior, *self._filters(self.parts)]
+
+    def _filters(self, parts: Parts) -> list[Alternative]:
+        """Return filters that move and correct the numbers of parts."""
+        return [replace(self.prior, map=self.map.with_numbers(*part)) for part in zip(*parts[:3], strict=True)]
 
     def move(self, estimator: Estimator, part: MotionPart) -> bool:
         """Move the robot by a part of its control; return whether that leads anywhere."""
@@ -124,220 +178,181 @@ class GaussianSum:
 
     def correct(self, estimator: Estimator, update: Update) -> None:
         """Correct by a reading of the robot's own state."""
-        seen = KnownObservation(
-            update, np.zeros(2), np.zeros(3), chi2_gate(SURVEYED, update.R.shape[1]), is_distance=False
-        )
         estimator.correct(self.prior.map, update)
-        for i, each in enumerate(self.parts):
-            self.log_weights[i] += log_likelihood(estimator.correct(each.map, update), 0, seen)
+        seen = KnownObservation(update, chi2_gate(SURVEYED, update.R.shape[1]))
+        self.parts.log_weights[:] += self._correct_parts(estimator, self.parts, seen)[1]
         self._prune()
+
+    def _correct_parts(
+        self, estimator: Estimator, parts: Parts, seen: KnownObservation
+    ) -> tuple[list[Correction], Array]:
+        """Correct parts by an observation; return how, and its log-likelihoods (M,)."""
+        done = [estimator.correct(each.map, seen.update) for each in self._filters(parts)]
+        Z = np.reshape([one.Z[0] for one in done], (-1, *seen.update.R.shape[1:]))
+        return done, log_likelihood(np.array([one.d2[0] for one in done]), Z, seen)
 
     def observe(self, estimator: Estimator, seen: KnownObservation) -> tuple[Correction | None, float]:
         """Correct by an observation of a known landmark; return what the likeliest part expected and the evidence.
 
         None where all parts begin by it.  The evidence is its log-likelihood under the whole sum.
         """
-        before = self._total()
-        parts, log_weights, expected = list[Alternative](), list[float](), None
-        likeliest = -math.inf
-        for each, w in zip(self.parts, self.log_weights.tolist(), strict=True):
-            for piece, w_piece, is_done in split_part(each, w, seen):
-                if is_done:
-                    gain = seen.anywhere
-                else:
-                    done = estimator.correct(piece.map, seen.update._replace(gate=seen.gate))
-                    gain = log_likelihood(done, 0, seen)
-                    if w_piece + gain > likeliest:
-                        likeliest, expected = w_piece + gain, done
-                parts.append(piece)
-                log_weights.append(w_piece + gain)
-        self.parts, self.log_weights = parts, np.array(log_weights)
-        self.prior_log += seen.anywhere
-        if not self.is_found:
-            self._begin(estimator, seen)
+        before, seen = self._total(), seen._replace(update=seen.update._replace(gate=seen.gate))
+        linear, rings = self._split(self.parts, seen)
+        done, gains = self._correct_parts(estimator, linear, seen)
+        linear.log_weights[:] += gains
+        rings.log_weights[:] += seen.anywhere
+        self.parts, self.prior_log = Parts.joined([linear, rings]), self.prior_log + seen.anywhere
+        if not self.is_found:  # parts begin from the prior
+            linear_too, rings = self._split(as_part(self.prior.map, self.prior_log), seen)
+            self._correct_parts(estimator, linear_too, seen)
+            self.parts = Parts.joined([self.parts, linear_too, rings])
+            self.prior_log -= 0.25 * seen.gate
         self._prune()
-        return expected, self._total() - before
-
-    def _begin(self, estimator: Estimator, seen: KnownObservation) -> None:
-        """Begin parts from the prior, by an observation."""
-        first = copy_alternative(self.prior)
-        pieces = split_part(first, self.prior_log, seen)
-        for piece, _, is_done in pieces:
-            if not is_done:
-                estimator.correct(piece.map, seen.update._replace(gate=seen.gate))
-        self.parts += [piece for piece, _, _ in pieces]
-        self.log_weights = np.append(self.log_weights, [w for _, w, _ in pieces])
-        self.prior_log -= 0.25 * seen.gate
+        return done[int(linear.log_weights.argmax())] if done else None, self._total() - before
 
     def _total(self) -> float:
-        return float(np.logaddexp(_log_sum(self.log_weights), self.prior_log))
+        return float(np.logaddexp(_log_sum(self.parts.log_weights), self.prior_log))
 
     def _prune(self) -> None:
         """Remove the parts without weight, and merge those that are alike."""
-        keep = np.argsort(-self.log_weights, kind="stable")[:MOST]
-        keep = keep[self.log_weights[keep] > self.log_weights.max(initial=-math.inf) + math.log(LEAST)]
-        self.parts, self.log_weights = [self.parts[i] for i in keep.tolist()], self.log_weights[keep]
+        w = self.parts.log_weights
+        keep = np.argsort(-w, kind="stable")[:MOST]
+        self.parts = self.parts.take(keep[w[keep] > w.max(initial=-math.inf) + math.log(LEAST)])
         top = max(self._total(), -1e300)
-        self.log_weights, self.prior_log = self.log_weights - top, self.prior_log - top
-        if len(self.parts) > 1:
+        self.parts.log_weights[:] -= top
+        self.prior_log -= top
+        if len(self.parts.P) > 1:
             self._merge()
 
     def _merge(self) -> None:
-        slot = self.prior.moving.slot
-        poses = np.array([each.map.mean(slot)[:3] for each in self.parts])
-        P = np.array([each.map.covariance([slot])[:3, :3] for each in self.parts])
-        left, parts, log_weights = np.arange(len(poses)), list[Alternative](), list[float]()
-        while len(left):
-            d = poses[left] - poses[left[0]]
-            d[:, 2] = wrap(d[:, 2])
-            off = np.einsum("ki,ki->k", d, np.linalg.solve(P[left] + P[left[0]], d[:, :, None])[:, :, 0])
-            group = left[off < ALIKE]
-            left = left[off >= ALIKE]
-            w = self.log_weights[group]
-            one = self.parts[group[0]]
-            if len(group) > 1:
-                slots = range(len(one.map.spaces))
-                means, cov = moments([self.parts[i] for i in group.tolist()], w, slots, slot)
-                write_blocks(one.map, slots, means, cov)
-            parts.append(one)
-            log_weights.append(_log_sum(w))
-        self.parts, self.log_weights = parts, np.array(log_weights)
+        parts = self.parts.whole()
+        r, P = parts.x[:, self.pose], parts.P[:, self.pose, self.pose]
+        of, (i, j) = np.arange(len(r)), np.triu_indices(len(r), 1)
+        d = r[j] - r[i]
+        d[:, 2] = wrap(d[:, 2])
+        near = squared_distances(P[i] + P[j], d)[0] < ALIKE
+        for one, other in np.column_stack([i, j])[near].tolist():
+            if of[one] == one and of[other] == other:
+                of[other] = one
+        order = np.argsort(of, kind="stable")
+        starts = np.flatnonzero(np.diff(of[order], prepend=-1))
+        first, merged = parts.take(order[starts]), self._moments(parts.take(order), starts)
+        is_one = np.diff(starts, append=len(r)) == 1
+        for after, before in zip(merged[:3], first[:3], strict=True):
+            after[is_one] = before[is_one]
+        self.parts = merged
 
     def moments(self, slots: Sequence[int]) -> tuple[list[Array], Array]:
-        """Return the means of some blocks, the robot's the first, and their joint covariance."""
-        return moments(self.parts, self.log_weights, slots, slots[0])
+        """Return the means of some blocks, and their joint covariance."""
+        one, rows = self._moments(self.parts.whole(), np.zeros(1, dtype=np.int64)), [self.map.rows(of) for of in slots]
+        return [one.x[0, of] for of in rows], one.P[0][np.ix_(*[np.concatenate(rows)] * 2)]
+
+    def _moments(self, parts: Parts, starts: Index) -> Parts:
+        """Return the moments of sums, one of the parts from each of `starts` (G,) on.
+
+        The mean heading and its variance -2 log |E exp(i theta)| are those of a wrapped Gaussian: a heading that may be
+        any stays one, however often its moments are taken.
+        """
+        log_sums, t, x, P = np.logaddexp.reduceat(parts.log_weights, starts), self.pose.stop - 1, parts.x, parts.P
+        of = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(x)))
+        w = np.exp(parts.log_weights - log_sums[of])
+        D = self._plus(x, -x[starts][of])
+        mean_turn = np.add.reduceat(w * np.exp(1j * D[:, t] - 0.5 * P[:, t, t]), starts)
+        middle = np.angle(mean_turn)
+        D[:, t] = middle[of] + wrap(D[:, t] - middle[of])
+        d = np.add.reduceat(w[:, None] * D, starts)
+        d[:, t] = middle
+        off = D - d[of]
+        cov = np.add.reduceat(w[:, None, None] * (P + off[:, :, None] * off[:, None, :]), starts)
+        spread = np.minimum(-2.0 * np.log(np.maximum(np.abs(mean_turn), 1e-300)), VAGUE_RAD**2)
+        cov[:, t, t] += np.maximum(0.0, spread - cov[:, t, t])
+        means = self._plus(x[starts], d)
+        return Parts(means, means.copy(), cov, log_sums)
+
+    def _plus(self, x: Array, d: Array) -> Array:
+        """Return means x (M, n) after errors d (M, n)."""
+        moved = x + d
+        moved[:, self.angles] = wrap(moved[:, self.angles])
+        return moved
+
+    # ------------------------------------------------------------------ splitting
+    def _split(self, parts: Parts, seen: KnownObservation) -> tuple[Parts, Parts]:
+        """Return parts split until an observation is as good as linear over each, and those that have taken it.
+
+        These are pieces of rings.
+        """
+        if not len(parts.P):
+            return parts, parts
+        parts, t = parts.whole(), self.pose.stop - 1
+        is_wide = parts.P[:, t, t] > TURN_RAD**2
+        narrow, wide = np.flatnonzero(~is_wide), np.flatnonzero(is_wide).tolist()
+        pieces = Parts.joined([parts.take(narrow), *(self._headings(parts, i) for i in wide)])
+        of = np.append(narrow, np.repeat(wide, PIECES)).astype(np.int64)
+        rows = np.r_[self.pose, self._mount_rows(seen)]
+        heads, P = pieces.x[:, rows], pieces.P[:, self.pose, self.pose]
+        y, R = (np.repeat(each, len(P), axis=0) for each in (seen.update.y, seen.update.R))
+        is_bent = seen.is_distance & bends(seen.update.model, heads, P, y, R)[:, 1:].any(axis=1)
+        rings = {i: ring for i in np.flatnonzero(is_bent) if (ring := self._ring(pieces, i, seen)) is not None}
+        taken = [parts.take(slice(0))]
+        for k in np.unique(of[[*rings]]):
+            ring = Parts.joined([ring for i, ring in rings.items() if of[i] == k])
+            ring.log_weights[:] += parts.log_weights[k] - _log_sum(ring.log_weights)  # the first one is no evidence
+            taken.append(ring)
+        return pieces.take(np.delete(np.arange(len(of)), [*rings])), Parts.joined(taken)
+
+    def _mount_rows(self, seen: KnownObservation) -> Index:
+        """Return the rows of a sensor's mount, none where that is not in the map."""
+        mount = seen.update.mount
+        return self.prior.map.rows(mount) if mount >= 0 else NO_SLOTS
+
+    def _headings(self, parts: Parts, i: int) -> Parts:
+        """Return a part as pieces of its heading."""
+        x, P, t, pose = parts.x[i], parts.P[i], self.pose.stop - 1, self.pose
+        g, place = P[:, t] / P[t, t], slice(t - 2, t)
+        turns = wrap(2 * math.pi * np.arange(PIECES) / PIECES)
+        wraps = (turns[:, None] + 2 * math.pi * np.arange(-3, 4)) ** 2 / (P[t, t] - PIECE_RAD**2)
+        logs = np.logaddexp.reduce(-0.5 * wraps, axis=1)
+        steps, own = turns[:, None] * g, np.tile(g, (PIECES, 1))
+        means = self._plus(x, steps)
+        means[:, pose] = turn_pose(np.tile(x[pose], (PIECES, 1)), steps[:, pose])
+        own[:, place] = [rotation(turn) @ g[place] for turn in turns.tolist()]
+        cov = P - np.outer(g, P[:, t]) + PIECE_RAD**2 * own[:, :, None] * own[:, None, :]
+        return Parts(means, means.copy(), cov, parts.log_weights[i] + logs - _log_sum(logs))
+
+    def _ring(self, parts: Parts, i: int, seen: KnownObservation) -> Parts | None:
+        """Return a part, corrected by a distance, as pieces of the ring about a landmark; None without a distance."""
+        x, P, t = parts.x[i], parts.P[i], self.pose.stop - 1
+        own = x[self._mount_rows(seen)]
+        found = measured_distance(seen, own)
+        if found is None:
+            return None
+        d, sigma = found
+        arm = rotation(x[t]) @ (own if len(own) else seen.at)[:2]
+        H = np.zeros((2, len(P)))
+        H[:, t - 2 : t], H[:, t] = np.eye(2), [-arm[1], arm[0]]
+        across = math.sqrt(2.0 * sigma * d) / SIGMAS  # the tangent leaves the ring by a sigma at the sigma points
+        count = max(PIECES, math.ceil(2 * math.pi * d / (OVERLAP * across)))
+        angles = 2 * math.pi * np.arange(count) / count
+        u = np.column_stack([np.cos(angles), np.sin(angles)])
+        C = across**2 * np.eye(2) + (sigma**2 - across**2) * u[:, :, None] * u[:, None, :]
+        z, S, to_all = seen.l + d * u - x[t - 2 : t] - arm, H @ P @ H.T + C, P @ H.T
+        toward, log_S = np.linalg.solve(S, z[:, :, None])[:, :, 0], np.linalg.slogdet(S)[1]
+        logs = -0.5 * (np.einsum("ki,ki->k", z, toward) + log_S)
+        keep = logs > logs.max() + math.log(LEAST)
+        cov = P - to_all @ np.linalg.solve(S[keep], to_all.T)
+        means = self._plus(x, toward[keep] @ to_all.T)
+        return Parts(means, means.copy(), cov, parts.log_weights[i] + logs[keep])
 
 
 def _log_sum(logs: Array) -> float:
     return float(np.logaddexp.reduce(logs)) if len(logs) else -math.inf
 
 
-def copy_alternative(other: Alternative) -> Alternative:
-    """Return the same robot once more."""
-    return Alternative.of(other.map, other.moving, len(other.map.spaces), other.since_ns)
-
-
-def write_blocks(map_: Map, slots: Sequence[int], means: Sequence[Array], cov: Array) -> None:
-    """Write blocks of a map and their joint covariance, independent of all else."""
-    for slot in slots:
-        map_.index(slot)  # to activate a block may move those that are active
-    rows = np.concatenate([map_.index(slot) for slot in slots])
-    map_.predict(rows, np.zeros_like(cov), cov)
-    for slot, mean in zip(slots, means, strict=True):
-        map_.set_predicted(slot, mean)
-
-
-def _spaces(map_: Map, slots: Sequence[int]) -> list[Space]:
-    """Return the spaces of blocks."""
-    return [space for slot in slots if (space := map_.spaces[slot]) is not None]
-
-
-def _heading(map_: Map, slots: Sequence[int], robot: int) -> int:
-    """Return which row of the joint covariance of blocks is the heading of a robot."""
-    return sum(len(map_.rows(slot)) for slot in slots[: [*slots].index(robot)]) + 2
-
-
-def moments(
-    parts: Sequence[Alternative], log_weights: Array, slots: Sequence[int], robot: int
-) -> tuple[list[Array], Array]:
-    """Return the means of blocks under a sum, and their joint covariance.
-
-    The mean heading and its variance -2 log |E exp(i theta)| are those of a wrapped Gaussian: a heading that may be any
-    stays one, however often its moments are taken.
-    """
-    w = np.exp(log_weights - _log_sum(log_weights))
-    spaces, first = _spaces(parts[0].map, slots), [parts[0].map.mean(slot) for slot in slots]
-    blocks, t = [*zip(slots, spaces, first, strict=True)], _heading(parts[0].map, slots, robot)
-    D = np.array([np.concatenate([of.minus(each.map.mean(slot), x) for slot, of, x in blocks]) for each in parts])
-    P = np.array([each.map.covariance(slots) for each in parts])
-    mean_turn = w @ np.exp(1j * D[:, t] - 0.5 * P[:, t, t])
-    middle = float(np.angle(mean_turn))
-    D[:, t] = middle + wrap(D[:, t] - middle)
-    d = w @ D
-    d[t] = middle
-    off = D - d
-    cov = np.einsum("k,kij->ij", w, P + off[:, :, None] * off[:, None, :])
-    spread = min(-2.0 * math.log(max(float(abs(mean_turn)), 1e-300)), VAGUE_RAD**2)
-    cov[t, t] += max(0.0, spread - cov[t, t])
-    return retract_blocks(parts[0].map, slots, d), 0.5 * (cov + cov.T)
-
-
-# ---------------------------------------------------------------------- splitting
-def split_part(each: Alternative, w: float, seen: KnownObservation) -> list[tuple[Alternative, float, bool]]:
-    """Return a part with its log weight split until an observation is as good as linear over each piece.
-
-    Pieces of a ring have taken the observation: the third of each is then true.
-    """
-    pieces = [(each, w)]
-    if not turn_holds(each.map.covariance([each.moving.slot])[:3, :3]):
-        pieces = headings(each, w)
-    out: list[tuple[Alternative, float, bool]] = []
-    for piece, w_piece in pieces:
-        is_bent = seen.is_distance and nonlinear_axes(piece.map, piece.moving.slot, seen)[1:].any()
-        around = ring(piece, seen) if is_bent else []
-        out += [(one, w_piece + more, True) for one, more in around]
-        if not around:
-            out.append((piece, w_piece, False))
-    rings = np.array([w_piece for _, w_piece, is_done in out if is_done])
-    if len(rings):  # their sum has the weight of what they are of: the first observation is no evidence
-        down = w - _log_sum(rings)
-        out = [(one, w_piece + down if is_done else w_piece, is_done) for one, w_piece, is_done in out]
-    return out
-
-
-def nonlinear_axes(map_: Map, robot: int, seen: KnownObservation) -> Flags:
-    """Return along which axes (3,) of a robot's pose no linearisation describes an observation."""
-    update = seen.update
-    pose = map_.mean(robot)[:3]
-    head = pose if update.mount < 0 else np.concatenate([pose, map_.mean(update.mount)])
-    return bends(update.model, head, map_.covariance([robot])[:3, :3], update.y, update.R)
-
-
-def headings(each: Alternative, w: float) -> list[tuple[Alternative, float]]:
-    """Return a part as pieces of its heading, with their log weights."""
-    slots, robot = range(len(each.map.spaces)), each.moving.slot
-    P, t = each.map.covariance(slots), _heading(each.map, slots, robot)
-    g, place = P[:, t] / P[t, t], slice(t - 2, t)
-    left = P - np.outer(g, P[:, t])
-    turns = wrap(2 * math.pi * np.arange(PIECES) / PIECES)
-    wraps = (turns[:, None] + 2 * math.pi * np.arange(-3, 4)) ** 2 / (P[t, t] - PIECE_RAD**2)
-    logs = np.logaddexp.reduce(-0.5 * wraps, axis=1)
-    out = []
-    for turn, more in zip(turns.tolist(), (logs - _log_sum(logs)).tolist(), strict=True):
-        means, own = retract_blocks(each.map, slots, g * turn), g.copy()
-        means[robot][:3] = turn_pose(each.map.mean(robot)[:3], g[t - 2 : t + 1] * turn)
-        own[place] = rotation(turn) @ g[place]
-        piece = copy_alternative(each)
-        write_blocks(piece.map, slots, means, left + PIECE_RAD**2 * np.outer(own, own))
-        out.append((piece, w + more))
-    return out
-
-
-def ring(each: Alternative, seen: KnownObservation) -> list[tuple[Alternative, float]]:
-    """Return a part, corrected by a distance, as pieces of the ring about a landmark, with their log likelihoods."""
-    slots, robot, mount = range(len(each.map.spaces)), each.moving.slot, seen.update.mount
-    r, own = each.map.mean(robot), np.zeros(0) if mount < 0 else each.map.mean(mount)
-    found = measured_distance(seen, own)
-    if found is None:
-        return []
-    d, sigma = found
-    P, t = each.map.covariance(slots), _heading(each.map, slots, robot)
-    arm = rotation(r[2]) @ (own if len(own) else seen.at)[:2]
-    H = np.zeros((2, len(P)))
-    H[:, t - 2 : t], H[:, t] = np.eye(2), [-arm[1], arm[0]]
-    across = math.sqrt(2.0 * sigma * d) / SIGMAS  # the tangent leaves the ring by a sigma at the sigma points
-    count = max(PIECES, math.ceil(2 * math.pi * d / (OVERLAP * across)))
-    angles = 2 * math.pi * np.arange(count) / count
-    u = np.column_stack([np.cos(angles), np.sin(angles)])
-    C = across**2 * np.eye(2) + (sigma**2 - across**2) * u[:, :, None] * u[:, None, :]
-    z, S, to_all = seen.l + d * u - r[:2] - arm, H @ P @ H.T + C, P @ H.T
-    toward, log_S = np.linalg.solve(S, z[:, :, None])[:, :, 0], np.linalg.slogdet(S)[1]
-    logs, out = -0.5 * (np.einsum("ki,ki->k", z, toward) + log_S), []
-    for k in np.flatnonzero(logs > logs.max() + math.log(LEAST)).tolist():
-        piece, cov = copy_alternative(each), P - to_all @ np.linalg.solve(S[k], to_all.T)
-        write_blocks(piece.map, slots, retract_blocks(each.map, slots, to_all @ toward[k]), 0.5 * (cov + cov.T))
-        out.append((piece, float(logs[k])))
-    return out
+def as_part(map_: Map, log_weight: float) -> Parts:
+    """Return the present state of a map as the only part of a sum."""
+    slots = range(len(map_.spaces))
+    mean = np.concatenate([map_.mean(slot) for slot in slots])[None]
+    return Parts(mean, mean.copy(), map_.covariance(slots)[None], np.array([log_weight]))
 
 
 def measured_distance(seen: KnownObservation, own: Array) -> tuple[float, float] | None:
@@ -358,10 +373,3 @@ def measured_distance(seen: KnownObservation, own: Array) -> tuple[float, float]
         if abs(d - before) < SETTLED:
             return d, math.sqrt(float(update.R[0, 0, 0])) / abs(slope)
     return None
-
-
-def retract_blocks(map_: Map, slots: Sequence[int], step: Array) -> list[Array]:
-    """Return the means of blocks after an error of all of them, one after the other."""
-    spaces = _spaces(map_, slots)
-    parts = np.split(step, np.cumsum([space.dof for space in spaces])[:-1])
-    return [space.plus(map_.mean(slot), part) for slot, space, part in zip(slots, spaces, parts, strict=True)]

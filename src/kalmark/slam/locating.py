@@ -19,6 +19,7 @@ from kalmark.association.global_start import FEWEST, FEWEST_NAMED, locate_points
 from kalmark.association.protocol import NEW, Decision
 from kalmark.association.query import Query
 from kalmark.events import Id
+from kalmark.filter.estimators import Update
 from kalmark.filter.map import Map
 from kalmark.geometry import frames3d
 from kalmark.geometry.frames import compose, inverse
@@ -28,11 +29,10 @@ from kalmark.models.protocols import distances_alone, place_of
 from kalmark.report import JudgedScan, Observation
 from kalmark.slam.gaussian_sum import (
     IN_A_ROW,
+    NOWHERE,
     GaussianSum,
     KnownObservation,
     log_likelihood,
-    nonlinear_axes,
-    write_blocks,
 )
 from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
@@ -118,16 +118,19 @@ def _nonlinear_axes(state: State, scan: ScanContext) -> Flags | None:
 
     None where nothing is.
     """
-    tracks, channel, map_ = state.tracks, scan.channel, state.map
+    tracks, found = state.tracks, []
     names: list[Any] = [name if name in tracks.known or name in state.surveys.trial else None for name in scan.ids]
-    groups, pose = tracks.any_by_model(channel, names), _covariance(state, scan)
-    found = [np.zeros(3, dtype=np.bool_)]
-    for model, rows in groups:
+    for model, rows in tracks.any_by_model(scan.channel, names):
         l = np.array([_place(state, names[k])[: model.d] for k in rows])
-        update = scan.known_update(model, l, rows)
-        head = channel.head(map_, scan.robot)
-        found.append(bends(update.model, head, pose, update.y, update.R))
-    return np.any(found, axis=0) if groups else None
+        found.append(_bent_axes(state.map, scan, scan.known_update(model, l, rows)))
+    return np.any(found, axis=0) if found else None
+
+
+def _bent_axes(map_: Map, scan: ScanContext, update: Update) -> Flags:
+    """Return along which axes (3,) of the pose no linearisation describes some observations."""
+    count, head = len(update.y), scan.channel.head(map_, scan.robot)
+    P = np.tile(map_.covariance([scan.robot])[:3, :3], (count, 1, 1))
+    return bends(update.model, np.tile(head, (count, 1)), P, update.y, update.R).any(axis=0)
 
 
 def _place(state: State, name: Any) -> Array:
@@ -141,7 +144,7 @@ def compare_alternatives(state: State, scan: ScanContext, judged: Sequence[Judge
     sum_ = state.sums.get(scan.event.robot)
     if sum_ is None or not can_be_summed(scan.channel) or not judged:
         return
-    done = {group.rows[i]: (group.done, i) for group in judged for i in range(len(group.rows))}
+    done = {k: (group.done.d2[i], group.done.Z[i]) for group in judged for i, k in enumerate(group.rows)}
     gain = 0.0
     for k, one in _seen(state, scan, sum_.prior.map):
         gain += log_likelihood(*done[k], one) if k in done else 0.0
@@ -199,8 +202,8 @@ def _seen(state: State, scan: ScanContext, map_: Map) -> list[tuple[int, KnownOb
             update = update._replace(R=update.R + E_l @ P_l @ E_l.T)
         place = place_of(model.landmark, l[None])
         is_distance = distances_alone(channel.sensor) and place is not None
-        where = np.full(2, np.nan) if place is None else place[0][0, :2]
-        out.append((k, KnownObservation(update, where, channel.at, _gate(scan), is_distance)))
+        where = NOWHERE if place is None else place[0][0, :2]
+        out.append((k, KnownObservation(update, _gate(scan), where, channel.at, is_distance)))
     return out
 
 
@@ -222,7 +225,7 @@ def _summed(state: State, scan: ScanContext, sum_: GaussianSum) -> Located:
             state.tracks.known.count([name], [True])
     _show(state, scan, sum_)
     for _, one in seen:
-        holds = turn_holds(_covariance(state, scan)) and not nonlinear_axes(state.map, scan.robot, one).any()
+        holds = turn_holds(_covariance(state, scan)) and not _bent_axes(state.map, scan, one.update).any()
         sum_.linear = sum_.linear + 1 if holds else 0
     if sum_.linear >= IN_A_ROW:
         del state.sums[robot]
@@ -236,7 +239,10 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     mounts = [channel.mount for (robot, _), channel in [*state.channels.items()] if robot == name]
     mounts += [reader.mount for (robot, _), reader in state.readers.items() if robot == name]
     slots = [moving.slot, *(slot for slot in (moving.bias, *mounts) if slot is not None and slot >= 0)]
-    write_blocks(state.map, slots, *sum_.moments(slots))
+    means, cov = sum_.moments(slots)
+    state.map.predict(state.rows([(slot, len(state.map.rows(slot))) for slot in slots]), np.zeros_like(cov), cov)
+    for slot, mean in zip(slots, means, strict=True):
+        state.map.set_predicted(slot, mean)
     state.clones.forget_current(name)
 
 

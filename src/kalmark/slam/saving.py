@@ -39,7 +39,7 @@ from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.track import ChannelKey, Status
 
-VERSION = 20
+VERSION = 21
 DESCRIPTION, NUMBERS, SUMS = "slam.json", "numbers", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
 
@@ -118,8 +118,7 @@ def fill_state(state: State, members: dict[str, bytes], landmarks: Landmark | No
 def _others(state: State) -> Iterator[tuple[str, Alternative]]:
     """Return the other filters of robots."""
     yield from state.alternatives.items()
-    for name, of in state.sums.items():
-        yield from ((name, each) for each in of.all())
+    yield from ((name, of.prior) for name, of in state.sums.items())
 
 
 def _columns(robots: dict[str, Robot]) -> dict[str, list[str]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array, Index
+from kalmark.compiled import form_for
 from kalmark.errors import ModelError
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
@@ -79,7 +80,7 @@ class ObservationModel:
         self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array
     ) -> tuple[Array, Array]:  # fmt: skip
         """Return the innovations' covariance Z (K, p, p) and d2 (K,) of y (K, m) from the blocks `slots`.  [S] (83)."""
-        run = corrections.compiled_compared if isinstance(self.model, tuple) else corrections.innovation_covariances
+        run = form_for(self.model, corrections.innovation_covariances)
         scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), math.inf
         return run(self.model, m.whole, scan)
 
@@ -87,7 +88,7 @@ class ObservationModel:
         self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array, how: str
     ) -> Array:  # fmt: skip
         """Return the noise (K, p, p) with which outliers count less, `how` one of `ROBUST`."""
-        run = corrections.compiled_weighed if isinstance(self.model, tuple) else corrections.robust_noise
+        run = form_for(self.model, corrections.robust_noise)
         k = DEGREES if how == STUDENT else huber_length(R.shape[1])
         scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), k
         return np.asarray(run(self.model, m.whole, scan, how == STUDENT))

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.geometry.angles import rotation, wrap
-from kalmark.geometry.spaces import SE2
-from kalmark.models.observe import linearize
+from kalmark.geometry.angles import wrap
+from kalmark.models.observe import innovations_and_jacobians
 
 SIGMAS = 2.0  # of the pose, at which its sigma points are
 SHARE = 0.5  # of a change that an iterated correction bears to be left out by a linearisation
@@ -34,43 +33,43 @@ def turn_holds(P: Array) -> bool:
 
 
 def sigma_point_steps(P: Array) -> Array:
-    """Return the steps (3, 3) to the sigma points of a pose, by rows, P (3, 3) = sum of their squares.
+    """Return the steps (M, 3, 3) to the sigma points of poses, by rows, P (M, 3, 3) = sum of their squares.
 
     That of the heading, with the position as it is correlated, comes first, then those of the position.
     """
-    sigma = math.sqrt(max(float(P[2, 2]), 1e-24))
+    sigma = np.sqrt(np.maximum(P[:, 2, 2:], 1e-24))
     along = P[:, 2] / sigma
-    own, V = np.linalg.eigh((P - np.outer(along, along))[:2, :2])
-    steps = np.zeros((3, 3))
-    steps[0] = along * min(SIGMAS, math.pi / sigma)
-    steps[1:, :2] = (SIGMAS * V * np.sqrt(np.maximum(own, 0.0))).T
+    own, V = np.linalg.eigh((P - along[:, :, None] * along[:, None, :])[:, :2, :2])
+    steps = np.zeros(P.shape)
+    steps[:, 0] = along * np.minimum(SIGMAS, math.pi / sigma)
+    steps[:, 1:, :2] = (SIGMAS * V * np.sqrt(np.maximum(own, 0.0))[:, None, :]).swapaxes(1, 2)
     return steps
 
 
 def turn_pose(r: Array, step: Array) -> Array:
-    """Return a pose r (3,) moved by a step (3,), along the arc that an unknown turn is."""
-    if step[2] == 0.0:
-        return SE2.plus(r, step)
-    arm = np.array([step[1], -step[0]]) / step[2]  # from the place about which the heading turns the position
-    return np.array([*r[:2] - arm + rotation(step[2]) @ arm, wrap(r[2] + step[2])])
+    """Return poses r (..., 3) moved by steps (..., 3), along the arcs that unknown turns are: by V(turn)."""
+    turn = step[..., 2]
+    arc = (step[..., 0] + 1j * step[..., 1]) * np.exp(0.5j * turn) * np.sinc(0.5 * turn / math.pi)
+    moved = r + np.stack([arc.real, arc.imag, turn], axis=-1)
+    moved[..., 2] = wrap(moved[..., 2])
+    return moved
 
 
-def bends(view: Any, head: Array, P: Array, y: Array, R: Array) -> Flags:
-    """Return along which axes (3,) of a pose no linearisation describes some of the observations y (K, m + n).
+def bends(view: Any, heads: Array, P: Array, y: Array, R: Array) -> Flags:
+    """Return along which axes (M, 3) of poses no linearisation describes observations y (M, m + n), one of each pose.
 
-    They are of landmarks known exactly, whose numbers come behind the measurement; `head` (h,) begins with the pose of
-    the covariance P (3, 3), and R (K, p, p) is the noise.
+    They are of landmarks known exactly, whose numbers come behind the measurement; `heads` (M, h) begin with the poses
+    of the covariances P (M, 3, 3), and R (M, p, p) is the noise.
     """
-    none, steps = np.zeros((len(y), 0)), sigma_point_steps(P)
-    e, _, E_h, _ = linearize(view, head, none, y)  # innovations are wrapped: they count from what is expected
-    white = np.linalg.inv(np.linalg.cholesky(R))
-    linear = np.einsum("kpq,kqi,ai->akp", white, E_h[:, :, :3], steps)
-    off = np.empty((2, *linear.shape))
-    for a, step in enumerate(steps):
-        for i, sign in enumerate((1.0, -1.0)):
-            there = np.concatenate([turn_pose(head[:3], sign * step), head[3:]])
-            change = -linearize(view, there, none, e)[1]
-            off[i, a] = np.einsum("kpq,kq->kp", white, change) - sign * linear[a]
+    steps, there, white = sigma_point_steps(P), np.repeat(heads, 6, axis=0), np.linalg.inv(np.linalg.cholesky(R))
+    both = np.concatenate([steps, -steps], axis=1)
+    there[:, :3] = turn_pose(there[:, :3], both.reshape(-1, 3))
+    z, E_h = innovations_and_jacobians(view, heads, y[:, :0], y)
+    y = np.repeat(y, 6, axis=0)
+    y[:, : z.shape[1]] -= np.repeat(z, 6, axis=0)  # innovations are wrapped: they count from what is expected
+    change = -innovations_and_jacobians(view, there, y[:, :0], y)[0].reshape(len(heads), 6, -1)
+    linear = both @ (white @ E_h[:, :, :3]).swapaxes(1, 2)
+    off = change @ white.swapaxes(1, 2) - linear
     off[~np.isfinite(off)] = np.inf
-    worst = np.linalg.norm(off, axis=3).max(axis=0)
-    return np.asarray((worst > SHARE * np.linalg.norm(linear, axis=2) + 1.0).any(axis=1))
+    bent = np.linalg.norm(off, axis=2) > SHARE * np.linalg.norm(linear, axis=2) + 1.0
+    return np.asarray(bent.reshape(-1, 2, 3).any(axis=1))
