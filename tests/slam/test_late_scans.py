@@ -103,3 +103,10 @@ def test_a_saved_filter_goes_on_bit_for_bit(tmp_path: Path) -> None:
 def test_a_lag_that_means_nothing_is_refused(sensor: Any, given: dict[str, Any], why: str) -> None:
     with pytest.raises(ModelError, match=why):
         km.Mount(sensor, **given)
+
+
+@pytest.mark.parametrize("way", [None, km.initialization.Hypotheses()])
+def test_a_sensor_that_starts_landmarks_late_has_no_lag(way: Any) -> None:
+    mount = km.Mount(km.sensors.Range(), sigma_lag_s=0.1, initialization=way)
+    with pytest.raises(ModelError, match="a Range whose lag is in the map starts landmarks at first sight"):
+        km.Slam(km.Robot("r", km.motion.Unicycle(), sensors={"radio": mount}))

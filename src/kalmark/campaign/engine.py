@@ -86,6 +86,7 @@ def _odd_models(motion: Any, mount: Mount) -> str:
         type(mount.sensor) is not RangeBearing
         or parameter_covariance(mount.sensor) is not None
         or mount.cov is not None
+        or mount.lags
         or mount.detector is not None
     ):
         return "the batched engine has ranges and bearings, of a sensor whose calibration is known"

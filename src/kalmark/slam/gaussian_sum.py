@@ -292,7 +292,7 @@ class GaussianSum:
         heads, P = pieces.x[:, rows], pieces.P[:, self.pose, self.pose]
         y, R = (np.repeat(each, len(P), axis=0) for each in (seen.update.y, seen.update.R))
         is_bent = seen.is_distance & bends(seen.update.model, heads, P, y, R)[:, 1:].any(axis=1)
-        rings = {i: ring for i in np.flatnonzero(is_bent) if (ring := self._ring(pieces, i, seen)) is not None}
+        rings = {i: ring for i in np.flatnonzero(is_bent).tolist() if (ring := self._ring(pieces, i, seen)) is not None}
         taken = [parts.take(slice(0))]
         for k in np.unique(of[[*rings]]):
             ring = Parts.joined([ring for i, ring in rings.items() if of[i] == k])

@@ -130,7 +130,7 @@ def _bent_axes(map_: Map, scan: ScanContext, update: Update) -> Flags:
     """Return along which axes (3,) of the pose no linearisation describes some observations."""
     count, head = len(update.y), scan.channel.head(map_, scan.robot)
     P = np.tile(map_.covariance([scan.robot])[:3, :3], (count, 1, 1))
-    return bends(update.model, np.tile(head, (count, 1)), P, update.y, update.R).any(axis=0)
+    return np.asarray(bends(update.model, np.tile(head, (count, 1)), P, update.y, update.R).any(axis=0))
 
 
 def _place(state: State, name: Any) -> Array:
@@ -240,7 +240,8 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     mounts += [reader.mount for (robot, _), reader in state.readers.items() if robot == name]
     slots = [moving.slot, *(slot for slot in (moving.bias, *mounts) if slot is not None and slot >= 0)]
     means, cov = sum_.moments(slots)
-    state.map.predict(state.rows([(slot, len(state.map.rows(slot))) for slot in slots]), np.zeros_like(cov), cov)
+    rows = state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots))
+    state.map.predict(rows, np.zeros_like(cov), cov)
     for slot, mean in zip(slots, means, strict=True):
         state.map.set_predicted(slot, mean)
     state.clones.forget_current(name)

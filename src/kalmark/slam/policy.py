@@ -76,17 +76,21 @@ def policy_of(
     if delayed is not None and not (isinstance(mount.sensor, Intersecting) and channel.landmark.kind == "point"):
         what = f"a {type(mount.sensor).__name__} does not start a {channel.landmark.kind} late"
         raise ModelError(f"{what}: expected one that has meet(), and points of the plane")
+    deferred = _deferred(mount, channel.landmark)
+    if channel.lags and (delayed is not None or (deferred is not None and not channel.is_ambiguous)):
+        what = f"a {type(mount.sensor).__name__} whose lag is in the map starts landmarks at first sight"
+        raise ModelError(f"{what}: expected one that can, or no lag")
     seen = [model.landmark for model in channel.models.values()]
     kinds = [kind.ray if isinstance(kind, AsPoint) else kind for kind in seen]
     reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
     varies = channel.noise_at is not None or channel.robust is not None
     looks_back = channel.sees_velocity or channel.lags
-    approaches, deferred = channel.far is not None or channel.depths, _deferred(mount, channel.landmark)
+    approaches = channel.far is not None or channel.depths
     return Policy(
         association, upkeep, mount.attention, mount.detector, deferred, delayed,
         _starts(association, upkeep), averages(association), upkeep.hold_back and not weighs(association), reviews,
         0.0 if channel.joins else linear or 0.0,
-        upkeep.keep_poses if delayed is None and not channel.sees_velocity else 0,
+        upkeep.keep_poses if delayed is None and not (channel.sees_velocity or channel.lags) else 0,
         not channel.finds_depth and channel.mount >= 0 and any(isinstance(kind, AnchoredHomogeneous) for kind in seen),
         (channel.robust is not None or association.threshold(channel.dof, 0.0) < math.inf)
         and delayed is None and (deferred is None or channel.is_ambiguous) and channel.starts_landmarks,

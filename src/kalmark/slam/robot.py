@@ -71,9 +71,9 @@ class Mount:
     and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
     by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
     called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas, and `lag_s`,
-    the time by which the stamps of its scans are late, if that has (docs/race_track.md).  `robust` makes outliers count less,
-    "huber" or "student" (docs/association.md; None: all count in full).  `classes` are those that the sensor reports of
-    landmarks.
+    the time by which the stamps of its scans are late, if that has (docs/race_track.md).  `robust` makes outliers count
+    less, "huber" or "student" (docs/association.md; None: all count in full).  `classes` are those that the sensor
+    reports of landmarks.
 
     >>> km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1), at=(0.3, 0.0, 0.0)).at
     array([0.3, 0. , 0. ])
