@@ -377,9 +377,15 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
 
 
 def _newer(look: _Look, pairs: Index) -> list[Id]:
-    """Return the landmarks of the newer part: by those that they were seen with, else by age."""
-    sides = _sides(look, pairs)
-    mine = (sides < 0) | ((sides == 0) & (np.arange(len(sides)) >= pairs[:, 1].min()))
+    """Return the landmarks of the newer part: by those that they were seen with, else by age.
+
+    It begins where fewest of the pairs have one on the wrong side, which was taken for another: these do not count.
+    """
+    older, newer = np.sort(pairs, axis=0).T
+    wrong = len(older) - np.searchsorted(older, newer) + np.arange(len(newer))
+    begin = newer[wrong.argmin()]
+    sides = _sides(look, pairs[(pairs[:, 0] < begin) & (begin <= pairs[:, 1])])
+    mine = (sides < 0) | ((sides == 0) & (np.arange(len(sides)) >= begin))
     return [look.names[i] for i in np.flatnonzero(mine).tolist()]
 
 

@@ -151,8 +151,8 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
     rows = _of_places(history, slam, fused if rows is None else rows)
     fused = _of_places(history, slam, fused)
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
-    begun = np.flatnonzero(history.fused & (history.outcome != "associated"))  # by a robot that was elsewhere, too
-    started = {ids.get(name, as_id(name)) for name in _in_the_end(history, begun)}
+    first = np.flatnonzero(history.fused & (history.outcome != "associated"))  # by a robot that was elsewhere, too
+    started = {ids.get(name, as_id(name)) for name in _in_the_end(history, first)}
     started |= {ids.get(change.landmark, as_id(change.landmark)) for change in again_begun}
     beforehand = {ids.get(str(name), name): prior for name, prior in {**_surveyed(history), **(known or {})}.items()}
     for name in dict.fromkeys(names.values()):
