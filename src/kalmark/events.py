@@ -486,7 +486,7 @@ def _depths(depth: Any) -> Array:
 
 
 Event = Control | Scan | Raw | Fix
-"""What `Slam.process` takes."""
+"""An argument of `Slam.process`."""
 
 _RANK: dict[type, int] = {Control: 0, Fix: 2}  # 1: of a scan, or of raw data
 

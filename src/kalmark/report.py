@@ -23,7 +23,7 @@ __all__ = [
 
 Late = tuple[int, str, str, int]
 OUTCOMES = ("associated", "new", "rejected", "ignored", "deferred", "tentative")
-"""What may become of an observation: `Observation.outcome`."""
+"""Possible outcomes of an observation: `Observation.outcome`."""
 ALONE = "measurement alone cannot start a landmark"
 INDEFINITE = "the covariance of its innovation is not positive definite"
 NOTHING = np.zeros((0, 0))

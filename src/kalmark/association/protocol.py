@@ -50,7 +50,7 @@ class Mixture:
 
 
 Decision = tuple[Id | Answer | Mixture | None, str]
-"""What an association returns of an observation: its landmark, or an answer, or None; and the reason."""
+"""Result of an association for an observation: its landmark, or an answer, or None; and the reason."""
 
 
 class Matched(NamedTuple):

@@ -23,7 +23,7 @@ from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.log import Section
 
 HEADING_S, HEADING_RAD = 1.0, 0.02
-"""Headings are taken so often, and are not believed to be better: errors of a compass last."""
+"""Headings are taken so often, and with a larger sigma: errors of a compass are correlated."""
 NORTH_RAD, START_RAD, FIELD_RAD = 0.2, 0.1, 0.1
 """Sigmas: of where north is, of a declination by the first heading, of a heading by a magnetic field."""
 STANDARD_GRAVITY, NOT_GRAVITY = 9.80665, 0.2  # m/s^2; a mean force farther off by this share is something else

@@ -41,7 +41,7 @@ class Topic:
     shift_s: Annotated[Number, "Added to the time of every message."] = 0.0
     fields: Annotated[
         Any,
-        "Columns, and the fields of the messages that have them, of a type that kalmark does not know: "
+        "Columns, and the fields of the messages that have them, of a type that kalmark does not read itself: "
         "`{id: tags[].id, range_m: tags[].distance}`; `[]`: of each element.",
     ] = None
 
@@ -69,7 +69,7 @@ class Moved(Posed, Noisy):
 
     at: Annotated[
         Literal["messages", "scans"],
-        "Where increments end: at the messages, or, on the interpolated path, at the scans: for slow odometry.",
+        "Ends of the increments: at the messages, or, on the interpolated path, at the scans: for slow odometry.",
     ] = "messages"
 
     def __post_init__(self) -> None:
@@ -162,7 +162,7 @@ class Scans(Carried):
     ] = None
     ids: Annotated[
         str | None,
-        "Where ids come from: of a point cloud the name of a field, of detections `class`; `none`: there are none.",
+        "Source of the ids: of a point cloud the name of a field, of detections `class`; `none`: there are none.",
     ] = None
     clusters: Annotated[str | None, "Point cloud: the field that numbers clusters; their means are taken."] = None
     landmark: Annotated[Any, "Range: id of the landmark that is measured."] = None

@@ -36,7 +36,7 @@ class Backend(StrEnum):
 
 def campaign(
     world: Annotated[str, typer.Argument(metavar="WORLD_OR_CONFIG", help="A YAML file or a shipped name.")],
-    runs: Annotated[int, typer.Option(min=1, help="How many runs of each estimator.")],
+    runs: Annotated[int, typer.Option(min=1, help="Number of runs of each estimator.")],
     estimator: Annotated[
         list[str] | None,
         typer.Option(

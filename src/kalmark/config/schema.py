@@ -207,7 +207,7 @@ class Mounted(ModelSection):
     association: Association | None = None
     """Association of this sensor; the configuration's `association` if absent."""
     attention: Attention | None = None
-    """Which landmarks of a scan to take; all if absent."""
+    """Selection of the landmarks of a scan; all if absent."""
     upkeep: Upkeep | None = None
     """Confirmation of landmarks; the configuration's `upkeep` if absent."""
     detector: Detector | None = None
@@ -244,7 +244,7 @@ class PlaneMounted(Mounted):
     """Keys of every sensor of the plane."""
 
     mount: MountConfig = MountConfig()
-    """Where the sensor sits on the robot."""
+    """Pose of the sensor in the robot frame."""
 
     @property
     def height_m(self) -> float:
@@ -256,7 +256,7 @@ class SpaceMounted(Mounted):
     """Keys of every sensor of space."""
 
     mount: SpaceMountConfig = SpaceMountConfig()
-    """Where the sensor sits on the robot."""
+    """Pose of the sensor in the robot frame."""
 
 
 BASES |= {("sensor", "plane"): PlaneMounted, ("sensor", "space"): SpaceMounted}
@@ -463,7 +463,7 @@ class Config(OfFile):
     landmarks: Landmark | None = None
     """Landmark type; what fits each sensor if absent."""
     association: Association = section_of("association", "identity")()
-    """Which landmark was that."""
+    """Data association: the landmark of each observation."""
     upkeep: Upkeep = section_of("upkeep", "upkeep")()
     """Confirmation of landmarks from observations without an id."""
     estimator: Estimator = section_of("estimator", "invariant")()

@@ -42,8 +42,8 @@ def find(path: Path) -> Path | None:
 def read(
     path: Path,
     request: Request,
-    detections: Annotated[Literal["slsjf", "rfs", "laser"], "Which detections."] = "slsjf",
-    steering: Annotated[Literal["ascii", "mat"], "Which steering calibration."] = "ascii",
+    detections: Annotated[Literal["slsjf", "rfs", "laser"], "Source of the detections."] = "slsjf",
+    steering: Annotated[Literal["ascii", "mat"], "Calibration of the steering."] = "ascii",
 ) -> Log:
     """Return the log with detections, and the encoders' calibration `ascii` or `mat`.
 

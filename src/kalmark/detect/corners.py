@@ -84,7 +84,7 @@ class Corners(Walls):
     columns: ClassVar[tuple[str, ...]] = ("range_m", "bearing_rad", "opening_rad")
     given: ClassVar[int] = 2
 
-    gap_m: Annotated[NotNegative, "How far from the corner the ends of its walls may be."] = 0.3
+    gap_m: Annotated[NotNegative, "Largest distance of the ends of its walls from the corner."] = 0.3
     bend_deg: Annotated[Acute, "Angle between the walls, at least."] = 30.0
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:

@@ -74,7 +74,7 @@ class Laser:
     incidence_deg: Annotated[
         Acute, "Neighbouring beams are on one surface if it can be hit under this angle at least."
     ] = 12.0
-    jump_m: Annotated[NotNegative, "How much more their ranges may differ."] = 0.15
+    jump_m: Annotated[NotNegative, "Largest further difference of their ranges."] = 0.15
     signature: Annotated[
         bool | None,
         "Give the third number of what is found to the filter; if absent, where the sensor has a signature.",

@@ -28,7 +28,7 @@ class Reflectors(Laser):
 
     intensity_min: Annotated[NotNegative, "A beam from a reflector is as bright as this at least."] = 1.0
     radius_m: Annotated[NotNegative, "Radius of the cylinders; 0: small and flat."] = 0.0
-    width_max_m: Annotated[Limit, "What is wider is no reflector."] = 0.5
+    width_max_m: Annotated[Limit, "Largest width of a reflector."] = 0.5
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
         if intensities is None:

@@ -29,7 +29,10 @@ def tune(
     out: Annotated[Path | None, typer.Option(help="The file to write. (default: out/CONFIG_tuned.yaml)")] = None,
     share: Annotated[float, typer.Option(help="Part of the log to tune by; the rest judges.")] = 0.5,
     aim: Annotated[
-        Aim, typer.Option(help="Where errors last: innovations, or a map, as uncertain as they claim.")
+        Aim,
+        typer.Option(
+            help="Figure to fit where errors are correlated: the innovations or the map get their stated covariance."
+        ),
     ] = Aim.INNOVATIONS,
     keep: Annotated[
         list[str] | None, typer.Option(metavar="KEY.PATH", help="Do not touch; may be given again.")

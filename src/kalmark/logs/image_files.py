@@ -19,7 +19,7 @@ from kalmark.logs.source import Request
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp")
 TRAILERS = {b"\x89PN": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
-"""What ends a file of PNG or JPEG, by the three bytes that begin it: its name may be wrong."""
+"""The end of a file of PNG or JPEG, by the three bytes that begin it: its name may be wrong."""
 TAIL = 64  # bytes at the end of a file in which its trailer is: some cameras pad their files
 DEPTH_SCALE = 5000.0  # of TUM RGB-D: a depth of 1 m is 5000
 

@@ -52,13 +52,13 @@ class Upkeep:
         "Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it again.",
     ] = False
     odds: Annotated[float, Within(ge=1), "So many times likelier than chance is beyond doubt."] = 100.0
-    gone: Annotated[Literal["mark", "remove"], "What becomes of landmarks that are not seen again."] = "mark"
+    gone: Annotated[Literal["mark", "remove"], "Treatment of landmarks that are no longer observed."] = "mark"
     p_detect: Annotated[
         float | None,
         Within(gt=0, lt=1),
-        "How often one in view is seen (absent: as in the log); with it, what is not seen again is removed.",
+        "Detection probability in view (absent: as in the log); if given, landmarks that are no longer observed go.",
     ] = None
-    p_false: Annotated[Probability, "How often something else is taken for a landmark that is gone."] = 0.05
+    p_false: Annotated[Probability, "Probability that something else is taken for a landmark that is gone."] = 0.05
     keep_poses: Annotated[
         int,
         Within(ge=0),

@@ -91,7 +91,7 @@ class _Lens(_PinHole):
 
     lens: Annotated[
         Literal["radial", "radtan", "equidistant", "tsai", "davison", "fov"],
-        "What `distortion` means: `radial` d1 r^2 + d2 r^4 + ..., `radtan` k1 k2 p1 p2 k3, `equidistant` k1 to k4,"
+        "Model of `distortion`: `radial` d1 r^2 + d2 r^4 + ..., `radtan` k1 k2 p1 p2 k3, `equidistant` k1 to k4,"
         " `tsai` c1 r_d^2 + c2 r_d^4 + ... to undistort, `davison` k of r_d = r / sqrt(1 + 2 k r^2), `fov` w in rad.",
     ] = "radial"
     distortion: Annotated[Numbers, "Coefficients of the lens; none for an ideal one."] = ()

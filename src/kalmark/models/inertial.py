@@ -174,7 +174,7 @@ class Inertial(MotionModel):
         2.0e-3
     )
     accelerometer_random_walk_mps2_per_sqrt_s: Annotated[NotNegative, "Random walk of the force's bias."] = 3.0e-3
-    gravity_mps2: Annotated[Positive, "What an accelerometer at rest reads."] = 9.81
+    gravity_mps2: Annotated[Positive, "Reading of an accelerometer at rest."] = 9.81
 
     space = Space("SE2(3) with biases", (VECTOR3, ROTATION, OWN, *(SCALAR,) * 6))
     columns = ("wx_radps", "wy_radps", "wz_radps", "ax_mps2", "ay_mps2", "az_mps2")

@@ -196,9 +196,9 @@ def optional(name: str, default: T) -> Callable[[object], T]:
 
 OPTIONAL = {"cov_size", "keep", "parameter_names"}
 finds_depth = optional("finds_depth", True)
-"""Whether one measurement determines how far the landmark is."""
+"""True where one measurement determines the distance of the landmark."""
 has_second_camera = optional("of_pair", False)
-"""Whether a frame of the sensor has the image of a second camera, to the right."""
+"""True where a frame of the sensor has the image of a second camera, to the right."""
 sees_kinds = optional("sees_kinds", cast("tuple[str, ...] | None", None))
 """The kinds of landmarks that a sensor measures, None for any that fits."""
 world_of = optional("world", "")
@@ -210,11 +210,11 @@ range_limit = optional("range_max_m", math.inf)
 field_of_view = optional("fov_rad", 2 * math.pi)
 """A sensor's field of view about its x axis, rad."""
 coasts = optional("coasts", False)
-"""Whether a robot moves without a control, as its state has a velocity."""
+"""True where a robot moves without a control, as its state has a velocity."""
 state_columns = optional("state_columns", cast("tuple[str, ...]", ()))
 """The names, with units, of a state's components behind the pose."""
 sees_rates = optional("sees_rates", False)
-"""Whether a sensor of a twist measures turn rates."""
+"""True where a sensor of a twist measures turn rates."""
 
 
 @runtime_checkable

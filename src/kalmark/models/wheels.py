@@ -128,9 +128,9 @@ class DifferentialDrive(PlanarMotion):
     sigma_way_m_per_sqrt_m: Annotated[NotNegative, "Error of a wheel's way, after one metre that it has rolled."] = 0.01
     sigma_wheel_rad: Annotated[NotNegative, "Error of each reading of a wheel: its resolution."] = 0.0
     sigma_radius_m: Annotated[
-        NotNegative, "How well each radius is known; above 0 both are in the map and are estimated."
+        NotNegative, "Standard deviation of each radius; above 0 both are in the map and are estimated."
     ] = 0.0
-    sigma_track_m: Annotated[Estimated, "How well the track is known"] = 0.0
+    sigma_track_m: Annotated[Estimated, "Standard deviation of the track"] = 0.0
 
     columns = ("left_rad", "right_rad")
     held = False

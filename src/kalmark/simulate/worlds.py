@@ -90,7 +90,7 @@ class World(OfFile):
     called: ClassVar[str] = "world"
 
     world: Layout
-    """Where the landmarks are."""
+    """Places of the landmarks."""
     robots: Annotated[dict[str, AnySimulatedRobot], Field(min_length=1)]
     """Robots by name."""
     steps: Count = 1000

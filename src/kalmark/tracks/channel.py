@@ -54,7 +54,7 @@ class ObservationModel:
     past: Array = field(default_factory=lambda: np.zeros(0))
 
     known: bool = False
-    """Whether the landmarks are known exactly: y (K, m + n) ends with their numbers, and the slots are the robot's."""
+    """True where the landmarks are known exactly: y (K, m + n) ends with their numbers; the slots are the robot's."""
 
     @cached_property
     def model(self) -> Any:

@@ -21,7 +21,7 @@ SEARCH = {
     "detector": {"type": "active_search"},
     "landmark": {"type": "homogeneous", "prior_rho_per_m": 0.5, "sigma_rho_per_m": 0.5},
 }
-"""How landmarks are found; of one camera alone the depths with which they begin are the unit of length."""
+"""Search for landmarks; of one camera alone the depths with which they begin are the unit of length."""
 CALIBRATIONS = ("calibration.yaml", "camera.yaml", "camera_info.yaml", "calibration.yml", "camera.yml", "config.yml")
 
 
