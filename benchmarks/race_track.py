@@ -1,6 +1,6 @@
 """A race track with the faults of real cars: cones that are missing or mapped twice, the error of the path, the time.
 
-    python benchmarks/race_track.py [--runs 20] [--fault slip]
+    python benchmarks/race_track.py [--runs 20] [--fault slipping]
 
 Every run has the filter that the world `race_track` ships with, but for a lag of 0 +- 0.1 s that it estimates; the
 faults are put into its log.  The truth only scores.
@@ -25,7 +25,6 @@ from kalmark.simulate import load_world, simulate
 
 LATE_S, SPIN_S, FOR_S = 0.06, 55.0, 2.0  # a spin begins in the second lap, while no cone is detected
 SAME_M = 1.0  # a cone is where the map has one within this, after alignment
-HIT, MOVED_M = 8, 1.5  # cones that are hit in the second lap, and moved so far
 LAG = "robots.car.sensors.lidar.lag_s", "robots.car.sensors.lidar.sigma_lag_s"
 CLEAN = (f"{LAG[0]}=0", f"{LAG[1]}=0", f"filter.{LAG[0]}=0", f"filter.{LAG[1]}=0.1")  # the filter estimates a lag
 

@@ -130,3 +130,8 @@ def test_classes_go_with_a_saved_map(tmp_path: Path) -> None:
     other = km.Slam.load(tmp_path / "map.kmk")
     assert other.classes("left") == slam.classes("left")
     assert other.robots["rover"].sensors["lidar"].classes == CONES
+
+
+def test_classes_of_a_sensor_that_measures_its_robot_are_refused() -> None:
+    with pytest.raises(ModelError, match="classes are given, but a Gyro2D measures its robot, expected None"):
+        km.Mount(km.sensors.Gyro2D(), classes=km.Classes())

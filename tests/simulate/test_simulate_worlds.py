@@ -215,6 +215,14 @@ def test_laying_over_replaces_a_section_of_another_type() -> None:
         (("type: constant", "type: konstant"), r"robots.rover.route.type: got 'konstant', .*did you mean constant"),
         (("steps: 5", "filter: {motion: 3}"), r"mine.yaml:7:10: motion: got an unknown key"),
         (("steps: 5", "noise_on: both"), r"mine.yaml:7:11: noise_on: got 'both', expected"),
+        *(
+            ((MINE.splitlines()[0], f"world: {{type: race_track, line_m: {line}}}"), "line_m: got .* at least 3 points")
+            for line in ("[[0, 0]]", "[[0, 0], [0, 0], [9, 9]]", "[[0, 0], [9, 0], [9, 9], [0, 0]]")
+        ),
+        (
+            ("type: constant, u: [0.5, 0.1]", "type: waypoints, points_m: [[0, 0], [9, 0]], smooth_m: 1"),
+            "robots.rover.route.points_m: got .*, expected at least 3 points",
+        ),
     ],
 )
 def test_a_wrong_world_is_refused_with_place_value_and_expectation(

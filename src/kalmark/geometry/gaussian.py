@@ -139,6 +139,12 @@ def bhattacharyya(a: Any, A: Any, b: Any, B: Any) -> float:
     return float(apart + (both - (np.linalg.slogdet(A)[1] + np.linalg.slogdet(B)[1]) / 2) / 2)
 
 
+def normalized_weights(log_weights: Array) -> Array:
+    """Return the weights (H,), whose sum is 1, of their logarithms."""
+    w = np.exp(log_weights - log_weights.max())
+    return np.asarray(w / w.sum())
+
+
 def quantile(probability: Any, dof: Any) -> Any:
     """Return the quantile of chi-square: of numbers, or of arrays that go together."""
     from scipy.special import gammaincinv

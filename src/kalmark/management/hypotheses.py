@@ -22,6 +22,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import Probability, Within, register
+from kalmark.geometry.gaussian import normalized_weights
 from kalmark.geometry.spaces import POINT2
 from kalmark.management.pending import OTHERS, HypothesisCorrection, Step
 from kalmark.models.landmarks import Polar2D
@@ -38,12 +39,6 @@ def to_point(l: Array) -> tuple[Array, Array]:
     """Return the point p (2,) of a polar hypothesis (4,), and P_l (2, 4)."""
     u = np.array([math.cos(l[2]), math.sin(l[2])])
     return l[:2] + l[3] * u, np.array([[1.0, 0.0, -l[3] * u[1], u[0]], [0.0, 1.0, l[3] * u[0], u[1]]])
-
-
-def normalized_weights(log_weights: Array) -> Array:
-    """Return the weights (H,), whose sum is 1, of their logarithms."""
-    w = np.exp(log_weights - log_weights.max())
-    return np.asarray(w / w.sum())
 
 
 @register("initialization", "hypotheses")

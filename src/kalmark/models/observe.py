@@ -114,7 +114,7 @@ def follow_in_space(twist: Array, seconds: float) -> tuple[Array, Array]:
 def mount_ago_in_plane(s: Array, lag_s: float, past: Array) -> tuple[Array, Array, Array]:
     """Return where a mount s (3,) was `lag_s` ago: B (3,) in the frame that its robot has now, B_s and B_lag (3, 1).
 
-    `past` (7,) has the lag at which the pose of the robot was exactly the last three, and the twist about it.
+    B = r0 o exp((t0 - lag) w) o s: `past` (7,) has the lag t0, the twist w about it and the pose r0 of the robot then.
     """
     d, d_t = follow_in_plane(past[1:4].copy(), past[0] - lag_s)
     D, _, D_d = compose(past[4:].copy(), d)

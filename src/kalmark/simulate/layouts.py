@@ -44,6 +44,16 @@ Point = Annotated[tuple[Number, ...], Field(strict=False)]
 Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)]
 
 
+def closed(points: tuple[tuple[float, ...], ...], *below: str) -> tuple[tuple[float, ...], ...]:
+    """Refuse points that no smooth closed line goes through."""
+    again = any(a == b for a, b in zip(points, (*points[1:], points[0]), strict=True))
+    if len(points) < 3 or len(points[0]) != 2 or again:
+        raise unexpected_value(
+            "at least 3 points [x, y], none of them twice in a row, the first not at the end", *below
+        )
+    return points
+
+
 @dataclass(frozen=True, eq=False)
 class Scenery:
     """The landmarks of a world: points (N, 2|3), segments (S, 6) from end to end, tags (T, 7) as poses, in m.
@@ -196,11 +206,11 @@ def along_closed_line(points: Array, spacing_m: float) -> tuple[Array, Array]:
     return np.asarray(line(along)), ahead[:, ::-1] * [-1.0, 1.0]
 
 
-class RaceTrack(OfPoints):
+class RaceTrack(LayoutSection):
     """Cones on both sides of a closed track: classes 0 to its left, 1 to its right and 2, two pairs, at its start."""
 
     type: Literal["race_track"] = "race_track"
-    line_m: Points
+    line_m: Annotated[Points, AfterValidator(closed)]
     """Places (x, y) on the middle of the track, the start first; a smooth closed line goes through them."""
     width_m: Positive = 3.5
     """Distance between the cones of both sides."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.random import Generator
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from kalmark.arrays import Array
 from kalmark.compiled import address_of, by_address, compiled, python_form, signature_of
@@ -35,7 +35,7 @@ from kalmark.models.motion import (
 )
 from kalmark.models.observe import MOVE, NOTHING, call_move
 from kalmark.models.protocols import HasVelocity, diffusion_of
-from kalmark.simulate.layouts import Points, along_closed_line
+from kalmark.simulate.layouts import Points, along_closed_line, closed
 from kalmark.simulate.sights import correlated
 
 SLOW_S = 1.0  # in which a robot steered by impulses turns to its target
@@ -105,6 +105,12 @@ class Waypoints(Drive):
     """The places (x, y), in space (x, y, z) too."""
     smooth_m: Positive | None = None
     """Drive along a smooth closed line through the places (x, y), from place to place at this distance."""
+
+    @model_validator(mode="after")
+    def _can_be_smooth(self) -> Waypoints:
+        if self.smooth_m is not None:
+            closed(self.points_m, "points_m")
+        return self
 
     def places(self, area: Array, rng: Generator) -> Iterator[Array]:
         """Yield the places (D,) to drive to, without end, within `area` (2, D)."""

@@ -344,10 +344,11 @@ def _mapped_again(
         P = state.map.covariance([scan.robot, tracks.slots[name]])
         rows = [*range(dof), *range(len(P) - d, len(P))]
         C = G @ P[np.ix_(rows, rows)] @ G.T + P_r @ cov[:dof, :dof] @ P_r.T
+        # of the gate: that of the unit ball, pi or 4 pi / 3, is about 4
         volume = 4.0 * gate(SURVEYED, d) ** (d / 2) * math.sqrt(max(np.linalg.det(C), 0.0))
         z, chance = p - places[nearest], volume / spacing**d
         if z @ np.linalg.solve(C, z) <= gate(SURVEYED, d) and chance < 1.0:
-            out[name] = max(math.log(max(chance, math.exp(-SURE))), -SURE)
+            out[name] = math.log(max(chance, math.exp(-SURE)))
     return out
 
 

@@ -12,6 +12,7 @@ from kalmark.errors import MapError
 from kalmark.events import Id
 from kalmark.filter.estimators import Estimator
 from kalmark.filter.map import AT_ONCE, Map
+from kalmark.geometry.gaussian import normalized_weights
 from kalmark.management import existence
 from kalmark.models.protocols import Landmark, Segmented, place_of
 from kalmark.report import Expectations, LandmarkTable
@@ -94,8 +95,7 @@ class Estimate:
         if track is None or not track.classes:
             return {}
         log_p = np.array([*track.classes.values()])
-        p = np.exp(log_p - log_p.max())
-        return dict(zip(track.classes, (p / p.sum()).tolist(), strict=True))
+        return dict(zip(track.classes, normalized_weights(log_p).tolist(), strict=True))
 
     def landmarks(self, *, exactly_known: bool = True) -> LandmarkTable:
         """Return ids, kinds, means, covariances and numbers of observations of all landmarks.

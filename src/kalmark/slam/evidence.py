@@ -73,14 +73,15 @@ class Evidence:
             self.ratio = 0.0
             return
         last, first, logs = (np.array(column) for column in zip(*self.missed.values(), strict=True))
-        twice = np.array([(self.seen[name][0], log) for name, log in (again or {}).items()]).reshape(-1, 2)
-        s = np.unique(np.concatenate([last, first - 1, twice[:, 0].astype(np.int64) - 1]))
+        again = again or {}
+        mapped = np.array([self.seen[name][0] for name in again], dtype=np.int64)
+        s = np.unique(np.concatenate([last, first - 1, mapped - 1]))
         ratios = logs @ ((last[:, None] <= s) & (s < first[:, None]))
         if self.seen:
             recent = islice(reversed(self.seen.values()), RECENT)
             begun, seen, gains = (np.array(column) for column in zip(*recent, strict=True))
             ratios = ratios + gains @ ((begun[:, None] <= s) & (s < seen[:, None]))
-        ratios = ratios + twice[:, 1] @ (s < twice[:, :1])
+        ratios = ratios + np.array([*again.values()]) @ (s < mapped[:, None])
         self.ratio, self.since_ns = float(ratios.min()), int(s[np.flatnonzero(ratios == ratios.min())[-1]])
 
     @property

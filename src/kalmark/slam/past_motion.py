@@ -1,9 +1,9 @@
 """The last motions of a robot, for sensors whose stamps are late: where the robot was when they saw what they show.
 
 The lag is estimated with the map, behind the mount of its sensor (`models/observe.py`).  About its mean the mount is
-where the motions of that time have it.  How it changes with the lag is the velocity at that time, of an interval before
-the one since the last scan: of the controls since then it would be correlated with their noise, which is in the
-innovation, too, and the lag would be wrong (errors in variables; an instrumental variable, Fuller 1987, section 1.4).
+where the motions of that time have it.  How it changes with the lag is the mean twist of an interval about that time,
+as long as the time since the last scan: the noise of the last control alone is in the innovation, too, and the lag
+would come out too small (errors in variables; Fuller 1987, section 1.1).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ KEPT_S = 3.0  # of motions: more than any lag, and some scans
 class PastMotion:
     """The last motions of a robot: their `seconds` (N,) and `twists` (N, 3 or 6) in its frame, the last ones first.
 
-    `scanned` has the time in ns of the last scan of each sensor that lags, counted by the motions since.
+    `scanned` has the seconds of motion since the last scan of each sensor that lags.
     """
 
     seconds: Array

@@ -119,6 +119,9 @@ class Mount:
             instance(self.initialization, one_of, "Mount: initialization", ways)
         if self.classes is not None:
             instance(self.classes, Classes, "Mount: classes", "a Classes")
+            if isinstance(self.sensor, OfState):
+                name = type(self.sensor).__name__
+                raise ModelError(f"Mount: classes are given, but a {name} measures its robot, expected None")
         if self.robust is not None:
             what = f"Mount: robust is {short_text(self.robust)}"
             if self.robust not in ROBUST:

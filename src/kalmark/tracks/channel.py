@@ -322,11 +322,12 @@ class Channel:
             R = self.noise_at(self.sensor.invert(y)[0])[0]
         if self.start_noise is not None and not own_noise:
             R = self.start_noise(y)[0]
-        L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
         if self.lags:
             size = len(self.at)
             _, B_s, B_lag = MOUNTS_AGO[size](observer[size : 2 * size], observer[2 * size], self.past)
             L_h = np.concatenate([L_r[0], L_s[0] @ B_s, L_s[0] @ B_lag], axis=1)
+        else:
+            L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
         if len(own):  # y = h(v, p) stays what it is: V_p = -V_y E_p
             L_h = np.concatenate([L_h, -L_y[0] @ sensor.parameters_jacobian(v)[0]], axis=1)
         return l[0], L_h, kernels.quadratic(L_y[0], np.array(R, dtype=np.float64)) + prior[0]

@@ -14,6 +14,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import Probability, Within, refuse, register
+from kalmark.geometry.gaussian import normalized_weights
 
 LogClasses = dict[str, float]  # log-likelihoods, those of classes that are not there are 0
 
@@ -78,9 +79,7 @@ class Classes:
 
     def probabilities(self, known: Mapping[str, float]) -> Array:
         """Return how likely a landmark is of each class (C,), by its log-likelihoods."""
-        log_p = np.array([known.get(name, 0.0) for name in self.names])
-        p = np.exp(log_p - log_p.max())
-        return np.asarray(p / p.sum())
+        return normalized_weights(np.array([known.get(name, 0.0) for name in self.names]))
 
 
 def add_report(known: LogClasses, classes: Classes, reported: str | None) -> None:
@@ -95,6 +94,5 @@ def distance_of_landmarks(one: Mapping[str, float], other: Mapping[str, float]) 
     names = list({**one, **other})
     if not names:
         return 0.0
-    a, b = (np.array([of.get(name, 0.0) for name in names]) for of in (one, other))
-    p, q = (np.exp(log_p - log_p.max()) for log_p in (a, b))
-    return -2.0 * math.log(len(names) * float(p @ q) / float(p.sum() * q.sum()))
+    p, q = (normalized_weights(np.array([of.get(name, 0.0) for name in names])) for of in (one, other))
+    return -2.0 * math.log(len(names) * float(p @ q))
