@@ -63,6 +63,8 @@ class Map(Protocol):
     averages: bool  # whether a scan can be fused by the mean over matchings
     dependent: bool  # whether a mount or an inertial unit is in it
     blocks: Table
+    atoms: Table
+    n: int  # degrees of freedom
     spaces: list[Space | None]
 
     def index(self, slot: int) -> Index:
@@ -160,7 +162,7 @@ class StochasticMap(Layout):
     def with_numbers(self, x: Array, x_first: Array, P: Array) -> StochasticMap:
         """Return a map of the same blocks, which cannot grow, of the means and first estimates (n,) and P (n, n)."""
         other = copy(self)
-        other.x, other.x_first, other.P, other._next = x, x_first, P, P
+        vars(other).update(x=x, x_first=x_first, P=P, _next=P)
         return other
 
     @property

@@ -149,19 +149,17 @@ def _point(scan: ScanContext, pending: Pending) -> Start | None:
 
     Mean and covariance are those of the mixture, and the bulge of the arcs is added.
     """
-    map_, w, slots = scan.map, normalized_weights(np.array(pending.log_weights)), pending.hypotheses
-    means, covs = [map_.mean(slot) for slot in slots], [map_.covariance([slot]) for slot in slots]
-    points = [to_point(l) for l in means]
-    p = np.asarray(sum(a * q for a, (q, _) in zip(w, points, strict=True)))
-    P = np.asarray(sum(a * (J @ C @ J.T) for a, (_, J), C in zip(w, points, covs, strict=True)))
-    B = np.asarray(sum(a * np.outer(q - p, q - p) for a, (q, _) in zip(w, points, strict=True)))
+    slots, w = pending.hypotheses, normalized_weights(np.array(pending.log_weights))
+    l, S, own = np.array([scan.map.mean(slot) for slot in slots]), scan.map.covariance(slots), np.arange(len(slots))
+    C, points = S.reshape(len(slots), 4, len(slots), 4)[own, :, own], [*map(to_point, l)]
+    q, J = (np.array(each) for each in zip(*points, strict=True))
+    p, off = w @ q, q - w @ q
+    P, B = np.einsum("k,kij->ij", w, J @ C @ J.swapaxes(1, 2)), (w * off.T) @ off
     if np.trace(np.linalg.solve(P, B)) > SPREAD:
         return None
-    for a, l, C in zip(w, means, covs, strict=True):
-        u, bulge = np.array([math.cos(l[2]), math.sin(l[2])]), 0.5 * l[3] * C[2, 2]
-        if bulge > BULGE * math.sqrt(float(u @ P @ u)):
-            return None
-        B = B + a * 2 * bulge**2 * np.outer(u, u)
-    G = np.concatenate([a * J for a, (_, J) in zip(w, points, strict=True)], axis=1)
-    Q = P + B - G @ map_.covariance(slots) @ G.T
+    u, bulge = J[:, :, 3], 0.5 * l[:, 3] * C[:, 2, 2]  # across the arc
+    if (bulge > BULGE * np.sqrt(((u @ P) * u).sum(axis=1))).any():
+        return None
+    G = np.concatenate(w[:, None, None] * J, axis=1)
+    Q = P + B + (2 * w * bulge**2 * u.T) @ u - G @ S @ G.T
     return Start(POINT2, p, tuple((slot, 4) for slot in slots), G, 0.5 * (Q + Q.T))

@@ -316,15 +316,16 @@ def innovations_and_jacobians(view: Any, head: Array, l: Array, y: Array) -> tup
 
 @compiled
 def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
-    _, z_0, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
-    k, p, h, n = len(y), z_0.shape[1], H_0.shape[2], L_0.shape[2]
-    z, E = np.empty((k, p)), np.empty((k, p, h + n))
+    _, _, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
+    (p, columns), k = append_columns(H_0[0], L_0[0]).shape, len(y)
+    z, E = np.empty((k, p)), np.empty((k, p, columns))
     for i in range(k):  # element by element: numba compiles slices for a second more
         _, z_i, H_i, L_i = linearize(view, head[i], l[i : i + 1], y[i : i + 1])
+        E_i = append_columns(H_i[0], L_i[0])
         for a in range(p):
             z[i, a] = z_i[0, a]
-            for c in range(h + n):
-                E[i, a, c] = H_i[0, a, c] if c < h else L_i[0, a, c - h]
+            for c in range(columns):
+                E[i, a, c] = E_i[a, c]
     return z, E
 
 

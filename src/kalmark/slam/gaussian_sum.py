@@ -31,7 +31,7 @@ from kalmark.geometry.angles import rotation, wrap
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import ANGLE, HEADING
 from kalmark.models.observe import linearize
-from kalmark.slam.alternative import Alternative
+from kalmark.slam.alternative import Alternative, write_robot
 from kalmark.slam.held_control import MotionPart, Moving
 from kalmark.tracks.linearity import SIGMAS, TURN_RAD, bends, turn_pose
 from kalmark.tracks.surveys import SURVEYED
@@ -51,21 +51,16 @@ NOWHERE = np.full(2, np.nan)
 
 
 class KnownObservation(NamedTuple):
-    """An observation of a landmark known exactly at l (2,): `update` has one row; `gate` is that of its d2.
+    """An observation of a landmark known exactly: `update` has one row; `gate` is that of its d2.
 
-    The sensor is at `at` (3,), unless its mount is in the map.  `is_distance`: it is a distance, or stands for one.
+    The landmark of one that is a distance, or stands for one, is at l (2,).  The sensor is at `at` (3,), unless its
+    mount is in the map.
     """
 
     update: Update
     gate: float
     l: Array = NOWHERE
     at: Array = NOWHERE
-    is_distance: bool = False
-
-    @property
-    def floor(self) -> float:
-        """The log-likelihood that an outlier has, whatever the pose."""
-        return self.anywhere - 0.25 * self.gate
 
     @property
     def anywhere(self) -> float:
@@ -78,7 +73,7 @@ def log_likelihood(d2: Any, Z: Array, seen: KnownObservation) -> Any:
 
     They are at least that of an outlier.
     """
-    return np.fmax(-0.5 * (d2 + np.linalg.slogdet(Z)[1]), seen.floor)
+    return np.fmax(-0.5 * (d2 + np.linalg.slogdet(Z)[1]), seen.anywhere - 0.25 * seen.gate)
 
 
 class Parts(NamedTuple):
@@ -127,15 +122,15 @@ class GaussianSum:
     def anywhere(cls, map_: Map, moving: Moving, blocks: int, t_ns: int, gate: float) -> GaussianSum:
         """Return the sum of a robot that may be elsewhere than the map has it: without a part yet, and unlikely."""
         prior = Alternative.of(map_, moving, blocks, t_ns)
-        rows = prior.map.index(moving.slot)[:3]
-        prior.map.predict(rows, np.zeros((3, 3)), np.diag([ANYWHERE_M, ANYWHERE_M, VAGUE_RAD]) ** 2)
+        pose, sigmas = prior.map.mean(moving.slot)[:3], np.array([ANYWHERE_M, ANYWHERE_M, VAGUE_RAD])
+        write_robot(prior.map, moving.slot, pose, np.diag(sigmas**2))
         return cls(prior, as_part(prior.map, 0.0).take(slice(0)), 0.0, 0.5 * IN_A_ROW * gate)
 
     def restored(self) -> None:
         """Check the arrays of a file.  Raises MapError."""
-        m, n = len(self.parts.log_weights), self.map.n
+        m, n = len(self.parts.log_weights), self.prior.map.n
         if [array.shape for array in self.parts] != [(m, n), (m, n), (m, n, n), (m,)]:
-            raise MapError(f"the parts of a sum have the shapes {[array.shape for array in self.parts]}")
+            raise MapError(f"the parts of a sum do not fit its map of {n} numbers")
 
     @property
     def shows(self) -> bool:
@@ -145,23 +140,12 @@ class GaussianSum:
     @property
     def is_found(self) -> bool:
         """True if its parts explain what was observed better than that it may be any."""
-        return _log_sum(self.parts.log_weights) > self.prior_log
-
-    @cached_property
-    def map(self) -> StochasticMap:
-        """The map of the prior."""
-        return cast(StochasticMap, self.prior.map)
-
-    @cached_property
-    def angles(self) -> Index:
-        """The rows (A,) of the parts that are angles."""
-        atoms = self.map.atoms
-        return atoms[np.isin(atoms[:, 0], (HEADING, ANGLE)), 2]
+        return np.logaddexp.reduce(self.parts.log_weights) > self.prior_log
 
     @cached_property
     def pose(self) -> slice:
         """The rows of the robot's pose."""
-        first = int(self.map.rows(self.prior.moving.slot)[0])
+        first = int(self.prior.map.rows(self.prior.moving.slot)[0])
         return slice(first, first + 3)
 
     def all(self) -> list[Alternative]:
@@ -170,7 +154,10 @@ class GaussianSum:
 
     def _filters(self, parts: Parts) -> list[Alternative]:
         """Return filters that move and correct the numbers of parts."""
-        return [replace(self.prior, map=self.map.with_numbers(*part)) for part in zip(*parts[:3], strict=True)]
+        return [
+            replace(self.prior, map=cast(StochasticMap, self.prior.map).with_numbers(*part))
+            for part in zip(*parts[:3], strict=True)
+        ]
 
     def move(self, estimator: Estimator, part: MotionPart) -> bool:
         """Move the robot by a part of its control; return whether that leads anywhere."""
@@ -196,7 +183,7 @@ class GaussianSum:
 
         None where all parts begin by it.  The evidence is its log-likelihood under the whole sum.
         """
-        before, seen = self._total(), seen._replace(update=seen.update._replace(gate=seen.gate))
+        before = self._total()
         linear, rings = self._split(self.parts, seen)
         done, gains = self._correct_parts(estimator, linear, seen)
         linear.log_weights[:] += gains
@@ -211,7 +198,7 @@ class GaussianSum:
         return done[int(linear.log_weights.argmax())] if done else None, self._total() - before
 
     def _total(self) -> float:
-        return float(np.logaddexp(_log_sum(self.parts.log_weights), self.prior_log))
+        return float(np.logaddexp(np.logaddexp.reduce(self.parts.log_weights), self.prior_log))
 
     def _prune(self) -> None:
         """Remove the parts without weight, and merge those that are alike."""
@@ -221,10 +208,6 @@ class GaussianSum:
         top = max(self._total(), -1e300)
         self.parts.log_weights[:] -= top
         self.prior_log -= top
-        if len(self.parts.P) > 1:
-            self._merge()
-
-    def _merge(self) -> None:
         parts = self.parts.whole()
         r, P = parts.x[:, self.pose], parts.P[:, self.pose, self.pose]
         of, (i, j) = np.arange(len(r)), np.triu_indices(len(r), 1)
@@ -244,7 +227,7 @@ class GaussianSum:
 
     def moments(self, slots: Sequence[int]) -> tuple[list[Array], Array]:
         """Return the means of some blocks, and their joint covariance."""
-        one, rows = self._moments(self.parts.whole(), np.zeros(1, dtype=np.int64)), [self.map.rows(of) for of in slots]
+        one, rows = self._moments(self.parts, np.array([0])), [self.prior.map.rows(of) for of in slots]
         return [one.x[0, of] for of in rows], one.P[0][np.ix_(*[np.concatenate(rows)] * 2)]
 
     def _moments(self, parts: Parts, starts: Index) -> Parts:
@@ -271,8 +254,9 @@ class GaussianSum:
 
     def _plus(self, x: Array, d: Array) -> Array:
         """Return means x (M, n) after errors d (M, n)."""
-        moved = x + d
-        moved[:, self.angles] = wrap(moved[:, self.angles])
+        moved, atoms = x + d, self.prior.map.atoms
+        angles = atoms[np.isin(atoms[:, 0], (HEADING, ANGLE)), 2]
+        moved[:, angles] = wrap(moved[:, angles])
         return moved
 
     # ------------------------------------------------------------------ splitting
@@ -285,25 +269,22 @@ class GaussianSum:
             return parts, parts
         parts, t = parts.whole(), self.pose.stop - 1
         is_wide = parts.P[:, t, t] > TURN_RAD**2
-        narrow, wide = np.flatnonzero(~is_wide), np.flatnonzero(is_wide).tolist()
-        pieces = Parts.joined([parts.take(narrow), *(self._headings(parts, i) for i in wide)])
-        of = np.append(narrow, np.repeat(wide, PIECES)).astype(np.int64)
-        rows = np.r_[self.pose, self._mount_rows(seen)]
-        heads, P = pieces.x[:, rows], pieces.P[:, self.pose, self.pose]
-        y, R = (np.repeat(each, len(P), axis=0) for each in (seen.update.y, seen.update.R))
-        is_bent = seen.is_distance & bends(seen.update.model, heads, P, y, R)[:, 1:].any(axis=1)
-        rings = {i: ring for i in np.flatnonzero(is_bent).tolist() if (ring := self._ring(pieces, i, seen)) is not None}
-        taken = [parts.take(slice(0))]
+        narrow, wide = np.flatnonzero(~is_wide), np.flatnonzero(is_wide)
+        pieces = Parts.joined([parts.take(narrow), *(self._headings(parts, i) for i in wide.tolist())])
+        of = np.append(narrow, np.repeat(wide, PIECES))
+        mount = seen.update.mount
+        own = pieces.x[:, self.prior.map.rows(mount) if mount >= 0 else NO_SLOTS]
+        heads, P = np.hstack([pieces.x[:, self.pose], own]), pieces.P[:, self.pose, self.pose]
+        bent = bends(seen.update.model, heads, P, seen.update.y, seen.update.R)
+        is_bent = np.isfinite(seen.l[0]) & bent[:, 1:].any(axis=1)
+        rings = {i: self._ring(pieces, i, seen, own[i]) for i in np.flatnonzero(is_bent).tolist()}
+        taken, done = [parts.take(slice(0))], [i for i, ring in rings.items() if len(ring.P)]
         for k in np.unique(of[[*rings]]):
             ring = Parts.joined([ring for i, ring in rings.items() if of[i] == k])
-            ring.log_weights[:] += parts.log_weights[k] - _log_sum(ring.log_weights)  # the first one is no evidence
+            w = ring.log_weights
+            w += parts.log_weights[k] - np.logaddexp.reduce(w)  # the first one is no evidence
             taken.append(ring)
-        return pieces.take(np.delete(np.arange(len(of)), [*rings])), Parts.joined(taken)
-
-    def _mount_rows(self, seen: KnownObservation) -> Index:
-        """Return the rows of a sensor's mount, none where that is not in the map."""
-        mount = seen.update.mount
-        return self.prior.map.rows(mount) if mount >= 0 else NO_SLOTS
+        return pieces.take(np.delete(np.arange(len(of)), done)), Parts.joined(taken)
 
     def _headings(self, parts: Parts, i: int) -> Parts:
         """Return a part as pieces of its heading."""
@@ -314,18 +295,20 @@ class GaussianSum:
         logs = np.logaddexp.reduce(-0.5 * wraps, axis=1)
         steps, own = turns[:, None] * g, np.tile(g, (PIECES, 1))
         means = self._plus(x, steps)
-        means[:, pose] = turn_pose(np.tile(x[pose], (PIECES, 1)), steps[:, pose])
+        means[:, pose] = turn_pose(x[pose], steps[:, pose])
         own[:, place] = [rotation(turn) @ g[place] for turn in turns.tolist()]
         cov = P - np.outer(g, P[:, t]) + PIECE_RAD**2 * own[:, :, None] * own[:, None, :]
-        return Parts(means, means.copy(), cov, parts.log_weights[i] + logs - _log_sum(logs))
+        return Parts(means, means.copy(), cov, parts.log_weights[i] + logs - np.logaddexp.reduce(logs))
 
-    def _ring(self, parts: Parts, i: int, seen: KnownObservation) -> Parts | None:
-        """Return a part, corrected by a distance, as pieces of the ring about a landmark; None without a distance."""
+    def _ring(self, parts: Parts, i: int, seen: KnownObservation, own: Array) -> Parts:
+        """Return a part, corrected by a distance, as pieces of the ring about a landmark; none without a distance.
+
+        `own` is the mount as it is in the map.
+        """
         x, P, t = parts.x[i], parts.P[i], self.pose.stop - 1
-        own = x[self._mount_rows(seen)]
         found = measured_distance(seen, own)
         if found is None:
-            return None
+            return parts.take(slice(0))
         d, sigma = found
         arm = rotation(x[t]) @ (own if len(own) else seen.at)[:2]
         H = np.zeros((2, len(P)))
@@ -342,10 +325,6 @@ class GaussianSum:
         cov = P - to_all @ np.linalg.solve(S[keep], to_all.T)
         means = self._plus(x, toward[keep] @ to_all.T)
         return Parts(means, means.copy(), cov, parts.log_weights[i] + logs[keep])
-
-
-def _log_sum(logs: Array) -> float:
-    return float(np.logaddexp.reduce(logs)) if len(logs) else -math.inf
 
 
 def as_part(map_: Map, log_weight: float) -> Parts:

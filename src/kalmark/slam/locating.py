@@ -27,6 +27,7 @@ from kalmark.geometry.gaussian import gate
 from kalmark.models.observe import linearize
 from kalmark.models.protocols import distances_alone, place_of
 from kalmark.report import JudgedScan, Observation
+from kalmark.slam.alternative import write_robot
 from kalmark.slam.gaussian_sum import (
     IN_A_ROW,
     NOWHERE,
@@ -128,9 +129,8 @@ def _nonlinear_axes(state: State, scan: ScanContext) -> Flags | None:
 
 def _bent_axes(map_: Map, scan: ScanContext, update: Update) -> Flags:
     """Return along which axes (3,) of the pose no linearisation describes some observations."""
-    count, head = len(update.y), scan.channel.head(map_, scan.robot)
-    P = np.tile(map_.covariance([scan.robot])[:3, :3], (count, 1, 1))
-    return np.asarray(bends(update.model, np.tile(head, (count, 1)), P, update.y, update.R).any(axis=0))
+    head, P = scan.channel.head(map_, scan.robot), map_.covariance([scan.robot])[:3, :3]
+    return np.asarray(bends(update.model, head[None], P[None], update.y, update.R).any(axis=0))
 
 
 def _place(state: State, name: Any) -> Array:
@@ -195,15 +195,14 @@ def _seen(state: State, scan: ScanContext, map_: Map) -> list[tuple[int, KnownOb
         if model is None or name is None:
             continue
         l = _place(state, name)[: model.d]
-        update = replace(scan, map=map_).known_update(model, l[None], [k])
+        update = replace(scan, map=map_).known_update(model, l[None], [k])._replace(gate=_gate(scan))
         if name not in tracks.known:
             E_l = linearize(model.model, channel.head(map_, scan.robot), l[None], scan.y[k : k + 1])[3][0]
             P_l = state.map.covariance([tracks.slot(name)])[: model.d, : model.d]
             update = update._replace(R=update.R + E_l @ P_l @ E_l.T)
-        place = place_of(model.landmark, l[None])
-        is_distance = distances_alone(channel.sensor) and place is not None
+        place = place_of(model.landmark, l[None]) if distances_alone(channel.sensor) else None
         where = NOWHERE if place is None else place[0][0, :2]
-        out.append((k, KnownObservation(update, _gate(scan), where, channel.at, is_distance)))
+        out.append((k, KnownObservation(update, _gate(scan), where, channel.at)))
     return out
 
 
@@ -240,8 +239,7 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     mounts += [reader.mount for (robot, _), reader in state.readers.items() if robot == name]
     slots = [moving.slot, *(slot for slot in (moving.bias, *mounts) if slot is not None and slot >= 0)]
     means, cov = sum_.moments(slots)
-    rows = state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots))
-    state.map.predict(rows, np.zeros_like(cov), cov)
+    state.map.predict(state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots)), np.zeros_like(cov), cov)
     for slot, mean in zip(slots, means, strict=True):
         state.map.set_predicted(slot, mean)
     state.clones.forget_current(name)
@@ -258,10 +256,8 @@ def note_adrift(state: State, scan: ScanContext) -> None:
 def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:
     """Put a robot of space where its sensor is at T (7,), with the covariance (6, 6), wherever it was."""
     slot = state.moving[name].slot
-    r = state.map.mean(slot)
-    to_robot = frames3d.compose(frames3d.inverse(channel.pose(state.map, slot))[0], r[:7])[0]
-    state.map.predict(state.map.index(slot)[:6], np.zeros((6, 6)), cov)
-    state.map.set_predicted(slot, np.append(frames3d.compose(T, to_robot)[0], r[7:]))
+    to_robot = frames3d.compose(frames3d.inverse(channel.pose(state.map, slot))[0], state.map.mean(slot)[:7])[0]
+    write_robot(state.map, slot, frames3d.compose(T, to_robot)[0], cov)
     state.clones.forget_current(name)
 
 

@@ -50,24 +50,23 @@ def turn_pose(r: Array, step: Array) -> Array:
     """Return poses r (..., 3) moved by steps (..., 3), along the arcs that unknown turns are: by V(turn)."""
     turn = step[..., 2]
     arc = (step[..., 0] + 1j * step[..., 1]) * np.exp(0.5j * turn) * np.sinc(0.5 * turn / math.pi)
-    moved = r + np.stack([arc.real, arc.imag, turn], axis=-1)
-    moved[..., 2] = wrap(moved[..., 2])
-    return moved
+    return np.stack([r[..., 0] + arc.real, r[..., 1] + arc.imag, wrap(r[..., 2] + turn)], axis=-1)
 
 
 def bends(view: Any, heads: Array, P: Array, y: Array, R: Array) -> Flags:
-    """Return along which axes (M, 3) of poses no linearisation describes observations y (M, m + n), one of each pose.
+    """Return along which axes (N, 3) of poses no linearisation describes observations y (N, m + n), one of each pose.
 
-    They are of landmarks known exactly, whose numbers come behind the measurement; `heads` (M, h) begin with the poses
-    of the covariances P (M, 3, 3), and R (M, p, p) is the noise.
+    They are of landmarks known exactly, whose numbers come behind the measurement; `heads` (N, h) begin with the poses
+    of the covariances P (N, 3, 3), and R (N, p, p) is the noise.  One pose, or one observation, stands for N.
     """
-    steps, there, white = sigma_point_steps(P), np.repeat(heads, 6, axis=0), np.linalg.inv(np.linalg.cholesky(R))
-    both = np.concatenate([steps, -steps], axis=1)
-    there[:, :3] = turn_pose(there[:, :3], both.reshape(-1, 3))
+    count, steps, white = max(len(heads), len(y)), sigma_point_steps(P), np.linalg.inv(np.linalg.cholesky(R))
+    heads, y = (np.repeat(each, count // len(each), axis=0) for each in (heads, y))
+    both, there = np.concatenate([steps, -steps], axis=1), np.repeat(heads[:, None], 6, axis=1)
+    there[..., :3] = turn_pose(there[..., :3], both)
     z, E_h = innovations_and_jacobians(view, heads, y[:, :0], y)
+    y[:, : z.shape[1]] -= z  # innovations are wrapped: they count from what is expected
     y = np.repeat(y, 6, axis=0)
-    y[:, : z.shape[1]] -= np.repeat(z, 6, axis=0)  # innovations are wrapped: they count from what is expected
-    change = -innovations_and_jacobians(view, there, y[:, :0], y)[0].reshape(len(heads), 6, -1)
+    change = -innovations_and_jacobians(view, there.reshape(len(y), -1), y[:, :0], y)[0].reshape(count, 6, -1)
     linear = both @ (white @ E_h[:, :, :3]).swapaxes(1, 2)
     off = change @ white.swapaxes(1, 2) - linear
     off[~np.isfinite(off)] = np.inf
