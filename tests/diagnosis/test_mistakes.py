@@ -14,7 +14,7 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.config.tree import parse_value
-from kalmark.diagnosis.gross_mistakes import gross
+from kalmark.diagnosis.gross_mistakes import as_likely_as_a_few_kinds, gross
 from kalmark.diagnosis.mistakes import Mistake, mistakes
 from kalmark.diagnosis.trials import FITS, fit_of_run, fit_with
 from kalmark.events import Control, Event, Scan
@@ -110,6 +110,14 @@ def test_beacons_above_the_plane_of_their_robot_are_named_with_their_height(tmp_
     assert right.mean < FITS < fit_of_run(run).mean
     assert right.likelihoods.sum() > wrong.likelihoods.sum()
     assert heights["-2"].cure == "--set robots.rover.sensors.radio.mount.z_m=-2"
+
+
+def test_many_sizes_of_one_mistake_leave_room_for_others() -> None:
+    """A robot that drives straight at first shows little of clockwise bearings."""
+    sizes = [Mistake("time_offset", "", "", {}, gain=k, value=0.1 * k) for k in range(8)]
+    others = [Mistake(name, "", "", {}, gain=-k) for k, name in enumerate(("a", "b", "bearing_sign", "c", "mount"), 1)]
+    tried = [one.name for one in as_likely_as_a_few_kinds([*sizes, *others])]
+    assert tried == ["time_offset"] * 8 + ["a", "b", "bearing_sign", "c"]
 
 
 def test_a_sensor_that_is_turned_over_later_is_named_with_the_time() -> None:

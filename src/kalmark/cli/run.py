@@ -107,8 +107,7 @@ def run(
                 if batch:
                     raise
                 say(f"warning: no batch solution: {error}", err=True)
-        judge(result)
-        result.save(out)
+        save(result, out)
     finish(result, out, name_on(name_of(Path(config), "config"), result.log.name))
     if summary.get("stopped"):
         raise typer.Exit(2)
@@ -122,6 +121,16 @@ def warm_up(
     with limit_blas_threads():
         slam_of(config, overrides or ()).warm_up()
     say("compiled: no event of such a run waits for it")
+
+
+def save(result: Run, out: Path) -> None:
+    """Write the run folder, then a short verdict with the pictures: its interruption loses nothing of the run."""
+    result.save(out, report=False)
+    try:
+        judge(result)
+    except KeyboardInterrupt:
+        say(f"warning: no verdict, as it was interrupted: kalmark diagnose {out} makes it", err=True)
+    result.finish(out)
 
 
 def judge(result: Run) -> None:
@@ -162,6 +171,5 @@ def demo(
         world = load_world("cloister")
         log, config = simulate(world, seed), world.config().model_copy(update={"seed": seed})
         result = record(build_slam(config, log), log, config=config_dict(config))
-        judge(result)
-        result.save(out)
+        save(result, out)
     finish(result, out, f"Sola's cloister, seed {seed}")

@@ -41,8 +41,8 @@ from kalmark.results.measures import Rigid, level, level_sigmas, rmse
 from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 
-FEW_SCANS = 80  # of them at first: a log that does not fit shows it soon
-LIKELIEST = 5  # mistakes of those by the first scans that are tried in more
+FEW_SCANS = 20, 80  # at first: of most mistakes a log shows soon that they were not made
+LIKELIEST = 5  # kinds of mistakes by the first scans, that are tried in more
 MUCH = 3.0  # times better is the log without the mistake
 LEAST_FIXES = 5  # in a row that do not fit: their robot is not where it should be
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
@@ -80,22 +80,29 @@ def likeliest(
 
     None, either, if they are likelier where what is far off is left out: no mistake is then why it is.
     """
-    every, few = (Trials(log, some, config) for some in (events, first_events(run, events, FEW_SCANS)))
-    changes, made = [*mistakes(config, run)], list[Mistake]()
+    changes = [*mistakes(config, run)]
     if (run.history.id == "").any():  # else what is left of the data shows it
         changes += [late for name in run.history.robots for late in late_or_early(config, events, name)]
-    gains = [
-        likelihood_gain(few.as_it_is, few.with_change(change))
-        for change in track(changes, "mistakes, one after the other", show=progress)
-    ]
-    least = max([-SURELY, *sorted(gains)[-LIKELIEST:][:1]])
-    for n in range(len(gains)):
-        if gains[n] >= least:
-            made += every.explain(changes[n])
+    for scans in FEW_SCANS:
+        few = Trials(log, first_events(run, events, scans), config)
+        tried = track(changes, f"mistakes in {scans} scans, one after the other", show=progress)
+        changes = [one for one in map(few.with_gain, tried) if one.gain >= -SURELY]
+    every = Trials(log, events, config)
+    tried = track(as_likely_as_a_few_kinds(changes), "the likeliest mistakes, one after the other", show=progress)
+    made = [one for change in tried for one in every.explain(change)]
     late = max((one for one in made if one.name == LATE), key=lambda one: one.gain, default=None)
     made = [one for one in made if one.name != LATE or one is late]
     off = [*every.explain(Mistake(OUTLIERS, "", "", gated(config)))] if made else []
     return first_of([one for one in made if all(one.gain > other.gain for other in off)])
+
+
+def as_likely_as_a_few_kinds(changes: Sequence[Mistake]) -> list[Mistake]:
+    """Return the changes with a gain of the likeliest kinds; many sizes of one kind keep no other one out."""
+    best = dict[str, float]()
+    for one in changes:
+        best[one.name] = max(one.gain, best.get(one.name, -math.inf))
+    least = sorted(best.values())[-LIKELIEST] if len(best) > LIKELIEST else -math.inf
+    return [one for one in changes if one.gain >= least]
 
 
 def late_or_early(config: Mapping[str, Any], events: list[Event], robot: str) -> Iterator[Mistake]:
@@ -104,7 +111,7 @@ def late_or_early(config: Mapping[str, Any], events: list[Event], robot: str) ->
     Where ids are unknown, the scans that show it most are of no landmark, and no residual is left of them.
     """
     mine = [[e.t_ns for e in events if isinstance(e, kind) and e.robot == robot] for kind in (Control, Scan)]
-    if min(map(len, mine)) >= FEW_SCANS:
+    if min(map(len, mine)) >= FEW_SCANS[-1]:
         control_s, scan_s = (float(np.median(np.diff(t_ns))) * 1e-9 for t_ns in mine)
         yield from (late_scans(config, robot, k * max(control_s, 0.5 * scan_s)) for k in STEPS)
 

@@ -7,6 +7,7 @@ what it leaves out.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -18,6 +19,7 @@ from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree, parse_value
+from kalmark.diagnosis.cause_texts import OR
 from kalmark.diagnosis.mistakes import Mistake, configured_value, robot_section, with_value
 from kalmark.errors import KalmarkError, LogError
 from kalmark.events import Event, Scan, sort_key
@@ -116,6 +118,10 @@ class Trials:
         """Return the fit of the events with a change."""
         return fit_with(self.log, self.events, change)
 
+    def with_gain(self, change: Mistake) -> Mistake:
+        """Return a change with its gain."""
+        return change._replace(gain=likelihood_gain(self.as_it_is, self.with_change(change)))
+
     def explain(self, change: Mistake) -> Iterator[Mistake]:
         """Yield a change with its gain, if the events fit with it, and are surely likelier."""
         after = self.with_change(change)
@@ -186,12 +192,11 @@ def with_cure(config: Mapping[str, Any], log: Log, cure: str) -> tuple[dict[str,
 
     None, too, if the log has nothing that a line names.
     """
-    lines = cure.split("--set ")
-    changed, read = dict(config), log
-    if len(lines) < 2 or lines[0].strip():
+    changed, read, options = dict(config), log, options_of(cure)
+    if not options:
         return None
-    for line in lines[1:]:
-        path, _, text = line.strip().strip("'").partition("=")
+    for option in options:
+        path, _, text = option.partition("=")
         names, value = tuple(path.split(".")), parse_value(text, "cure")
         if names[0] == "log":
             is_factor, now = names[1] == "factors", configured_value(config, names)
@@ -205,6 +210,16 @@ def with_cure(config: Mapping[str, Any], log: Log, cure: str) -> tuple[dict[str,
                 changed = with_value(changed, names[:2], changed["robots"]["each"])
             changed = with_value(changed, names, value)
     return changed, read, list(read.events)
+
+
+def options_of(cure: str) -> list[str]:
+    """Return the options KEY=VALUE of a cure, of the first where it has alternatives; none of one in words.
+
+    >>> options_of("--set robots.car.sensors.lidar.scale=0.99; or: --set robots.car.motion.sigma_v_scale=0.01")
+    ['robots.car.sensors.lidar.scale=0.99']
+    """
+    words = shlex.split(cure.split(OR, maxsplit=1)[0]) if cure.startswith("--set ") else []
+    return words[1::2] if {*words[::2]} <= {"--set"} else []
 
 
 def _nested(names: Sequence[str], value: float) -> dict[str, Any]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -189,17 +191,16 @@ def _with_cure(
 
     That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
     """
-    tried = _suspects(verdict.search, TRIED)
+    suspects = _suspects(verdict.search, TRIED)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
-    doubted |= any(f.name == LATE or f.begins for f in tried)  # whose sizes are so far from linear
+    doubted |= any(f.name == LATE or f.begins for f in suspects)  # whose sizes are so far from linear
     if len(run.history.d2) > AT_ONCE or not doubted:
         return verdict
-    tried = [*also, *tried, *_of_less_certain_controls(run, log, most, progress)]
+    tried: Iterable[Finding] = chain(also, suspects, _of_less_certain_controls(run, log, most, progress))
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
     for _ in range(ROUNDS):
-        cured = [without_error(*at, f) for f in tried]
-        gain, without, changed, one = max(cured, key=lambda of: of[0], default=(0.0, *at, None))
+        gain, without, changed, one = _likeliest_cure(*at, tried)
         if one is None or gain < LEAST_GAIN:
             break
         have = [taken[key]] if (key := (one.name, *one.of, str(one.since_s))) in taken else []
@@ -208,7 +209,7 @@ def _with_cure(
         rest = _judged(*at, _structural(*at, []), most, progress)
         tried = _suspects(rest.search, 1)
         if fit_of_run(without).mean > MISFITS_ALL:
-            tried += _of_less_certain_controls(*at, most, progress)
+            tried = chain(tried, _of_less_certain_controls(*at, most, progress))
     if not taken or sum(one.gain for one in taken.values()) < least:
         return verdict
     causes = [_cause(run, f, log) for f in taken.values()]
@@ -220,16 +221,27 @@ def _with_cure(
     return replace(verdict, map=status, causes=(*before, *causes, *after))
 
 
-def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> tuple[Finding, ...]:
-    """Return the systematic errors that a search finds by associations of less certain controls."""
+def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding]) -> tuple[float, Run, Log, Finding | None]:
+    """Return the cure with which the log of a run is likeliest, as `without_error`; none is tried after one that fits.
+
+    Where it fitted before, each may.
+    """
+    best: tuple[float, Run, Log, Finding | None] = 0.0, run, log, None
+    fitted = fit_of_run(run).mean < FITS
+    for finding in tried:
+        best = max(best, without_error(run, log, finding), key=lambda of: of[0])
+        if not fitted and fit_of_run(best[1]).mean < FITS:
+            break
+    return best
+
+
+def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> Iterator[Finding]:
+    """Yield the systematic errors that a search finds by associations of less certain controls."""
     wide = associated(run, log)
-    if wide is run:
-        return ()
-    try:
-        search = search_causes(wide, log, most, max(AT_ONCE, MORE * most), progress).search
-    except (KalmarkError, np.linalg.LinAlgError):
-        return ()
-    return tuple(f for f in _steady(search) if f.unit != TIMES)[:TRIED]
+    if wide is not run:
+        with suppress(KalmarkError, np.linalg.LinAlgError):
+            search = search_causes(wide, log, most, max(AT_ONCE, MORE * most), progress).search
+            yield from [f for f in _steady(search) if f.unit != TIMES][:TRIED]
 
 
 def _suspects(search: Search | None, most: int) -> list[Finding]:

@@ -50,20 +50,27 @@ class Run(Recording):
         self.summary.update(summary)
         return summary
 
-    def save(self, folder: str | Path) -> Path:
+    def save(self, folder: str | Path, *, report: bool = True) -> Path:
         """Write the run folder of the contract; files of an earlier run in it are replaced, all others stay.
 
         The folder has all files of the earlier run or all of this one, whatever happens meanwhile: `replace_folder`.
+        Without `report` it has no pictures and no page yet: `finish` writes them.
         """
-        folder, summary = Path(folder), self.summary or self.evaluate()
+        folder = Path(folder)
 
         def fill(made: Path) -> None:
             self.save_files(made)
-            self.report(made)
-            write(made / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+            self.finish(made, report=report)
 
         replace_folder(folder, fill, FILES, "summary.json")
         return folder
+
+    def finish(self, folder: Path, *, report: bool = True) -> None:
+        """Write the figures and, with `report`, the pictures and the page into a run folder: all that has a verdict."""
+        summary = self.summary or self.evaluate()
+        if report:
+            self.report(folder)
+        write(folder / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
 
     def report(self, folder: str | Path, world: bool = False) -> list[Path]:
         """Write ``map.png``, ``report.html`` and each sensor's last scan into a folder; return their paths.
