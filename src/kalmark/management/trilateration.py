@@ -17,7 +17,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Index
 from kalmark.declare import Probability, Within, register
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import POINT2
@@ -28,7 +28,8 @@ from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
 
 STEPS = 25  # of a search,
-SETTLED = 1e-7  # which is over when they are shorter, m
+ROUGH, SETTLED = 1e-6, 1e-12  # which is over when the next one changes chi-square by less; rough while they compete,
+TOGETHER = 0.01  # and in which positions come together that are so many sigmas apart
 OUTLIER = 0.9999  # a set of ranges that fits worse than this probability has one that is wrong
 BULGE = 0.03  # how far a circle may leave its tangent within a sigma of the position, in sigmas of the range
 OUT = 3.0  # sigmas from the minimum at which its shape is tested,
@@ -39,9 +40,9 @@ SHAPE = 2.0  # and by how much less the likelihood may fall off there than a Gau
 class Fits(NamedTuple):
     """Fit of J positions l (J, 2) to n ranges: `cost` = -2 log likelihood and chi-square (J,), residuals z (J, n).
 
-    `H` (J, n, 2) is with respect to the position, `H_x` (J, n, k + 2 n) to the sensor's own parameters in the map and
-    its places, `inverse` (J, n, n) that of the covariance, and `R` (J, n) the ranges' variances, as the position would
-    have them.
+    `H` (J, n, 2) is with respect to the position, `H_w` (J, n, k + 2) to the sensor's own parameters in the map and the
+    place of each range, `inverse` (J, n, n) that of the covariance, and `R` (J, n) the ranges' variances, as the
+    position would have them.
     """
 
     l: Array
@@ -49,12 +50,12 @@ class Fits(NamedTuple):
     chi2: Array
     z: Array
     H: Array
-    H_x: Array
+    H_w: Array
     inverse: Array
     R: Array
 
-    def of(self, j: int) -> Fits:
-        """Return that of one position."""
+    def of(self, j: int | Index) -> Fits:
+        """Return that of one position, or of some."""
         return Fits(*(each[j] for each in self))
 
     @property
@@ -66,7 +67,8 @@ class Fits(NamedTuple):
 class RangeProblem(NamedTuple):
     """Fit of positions (J, 2) to ranges from the sensor's places (n, 2), and the blocks that those depend on.
 
-    `S` is the covariance of the sensor's k own parameters and its places, `S_x` (k + 2 n, .) their Jacobian.
+    `S_x` (n, k + 2, .) is the Jacobian of the sensor's k own parameters and each place, `S` (n, k + 2, n, k + 2) the
+    covariance of these.
     """
 
     slots: list[int]
@@ -78,7 +80,7 @@ class RangeProblem(NamedTuple):
     @property
     def own(self) -> int:
         """Number of the sensor's parameters in the map."""
-        return len(self.S) - self.places.size
+        return self.S_x.shape[1] - 2
 
 
 @register("initialization", "trilateration")
@@ -133,7 +135,7 @@ class Trilateration:
         now, damping = problem.fit(starts), np.full(len(starts), 1e-3)
         most = chi2_gate(OUTLIER, max(1, len(kept) - 2))
         for all_ in (False, True):  # where the likeliest minimum does not determine it, the others are not sought
-            now, damping = _search(problem.fit, now, damping, all_)
+            now, damping = _search(problem.fit, now, damping, ROUGH, all_)
             best = now.of(int(np.argmin(now.cost)))
             if best.chi2 <= most and not _is_determined(problem, best, bent):
                 return Step("deferred", f"{len(kept)} ranges do not determine yet where it is")
@@ -146,9 +148,12 @@ class Trilateration:
         apart = np.einsum("ji,ik,jk->j", gaps, information, gaps) > 1.0
         if (apart & (now.cost - best.cost < -2 * math.log(self.odds))).any():
             return Step("deferred", f"{len(kept)} ranges fit two positions")
-        W = np.linalg.solve(information, best.H.T @ best.inverse)
+        first = np.argmin(now.cost, keepdims=True)
+        best = _search(problem.fit, now.of(first), damping[first], SETTLED)[0].of(0)
+        W = np.linalg.solve(best.information, best.H.T @ best.inverse)
         parts = tuple((slot, len(scan.map.rows(slot))) for slot in problem.slots)
-        start = Start(POINT2, best.l, parts, -W @ best.H_x @ problem.S_x, (W * best.R) @ W.T)
+        H_x = np.einsum("iw,iwx->ix", best.H_w, problem.S_x)
+        start = Start(POINT2, best.l, parts, -W @ H_x, (W * best.R) @ W.T)
         return Step("new", f"from {len(kept)} ranges", start=start, measurements=len(kept))
 
 
@@ -172,57 +177,66 @@ def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> RangeProblem:
     slots = clones if channel.mount < 0 else [channel.mount, *clones]
     P, first = map_.covariance(slots), 0 if channel.mount < 0 else len(map_.rows(channel.mount))
     own = max(first - 3, 0)
-    places, S_x = np.empty((n, 2)), np.zeros((own + 2 * n, len(P)))
-    S_x[:own, 3:first] = np.eye(own)
+    places, S_x = np.empty((n, 2)), np.zeros((n, own + 2, len(P)))
+    S_x[:, :own, 3:first] = np.eye(own)
     for i, slot in enumerate(clones):
         r, mount, _ = channel.split(channel.observer(map_, slot))
         T, T_r, T_s = sensor_pose(r, mount)
-        places[i], rows = T[:2], slice(own + 2 * i, own + 2 * i + 2)
-        S_x[rows, first + 3 * i : first + 3 * i + 3] = scan.estimator.pose_jacobian(map_, slot, T_r[:2])
+        places[i] = T[:2]
+        S_x[i, own:, first + 3 * i : first + 3 * i + 3] = scan.estimator.pose_jacobian(map_, slot, T_r[:2])
         if channel.mount >= 0:
-            S_x[rows, :3] = T_s[:2]
-    S, each = S_x @ P @ S_x.T, np.arange(n)
+            S_x[i, own:, :3] = T_s[:2]
+    S = np.einsum("iwx,xy,jvy->iwjv", S_x, P, S_x, optimize=True)
     y, variance = np.array([m.y[0] for m in kept]), np.array([m.R[0, 0] for m in kept])
     varies = np.array([_varies(scan, m) for m in kept])
 
     def fit(l: Array) -> Fits:
         v = (l[:, None] - places).reshape(-1, 2)
         e, E_v = sensor.expect(v)
-        H, H_x = E_v.reshape(-1, n, 2), np.zeros((len(l), n, len(S)))
-        for axis in range(2):
-            H_x[:, each, own + 2 * each + axis] = -H[:, :, axis]
-        if own:
-            H_x[:, :, :own] = sensor.parameters_jacobian(v).reshape(-1, n, own)
+        H = E_v.reshape(-1, n, 2)
+        H_w = np.concatenate([sensor.parameters_jacobian(v).reshape(-1, n, own), -H], axis=2) if own else -H
         R = np.tile(variance, (len(l), 1))
         if varies.any():
             R[:, varies] = sensor.range_variance(e).reshape(-1, n)[:, varies]
-        Sigma = H_x @ S @ H_x.transpose(0, 2, 1) + R[:, :, None] * np.eye(n)
+        Sigma = np.einsum("jiw,iwkv,jkv->jik", H_w, S, H_w)
+        Sigma[:, range(n), range(n)] += R
         z, inverse = y - e.reshape(-1, n), np.asarray(np.linalg.inv(Sigma), dtype=np.float64)
         chi2 = np.einsum("ji,jik,jk->j", z, inverse, z)
-        return Fits(l, chi2 + np.linalg.slogdet(Sigma)[1], chi2, z, H, H_x, inverse, R)
+        return Fits(l, chi2 + np.linalg.slogdet(Sigma)[1], chi2, z, H, H_w, inverse, R)
 
     return RangeProblem(slots, S_x, S, fit, places)
 
 
-def _search(fit: Callable[[Array], Fits], now: Fits, damping: Array, all_: bool) -> tuple[Fits, Array]:
+def _search(
+    fit: Callable[[Array], Fits], now: Fits, damping: Array, settled: float, all_: bool = True
+) -> tuple[Fits, Array]:
     """Return positions (J, 2) after Levenberg's and Marquardt's steps, and the damping (J,) of these.
 
-    The search is over when all of them have settled in a minimum, or the likeliest one.
+    The search is over when all of them have settled in a minimum, or the likeliest one; of those that come together one
+    is left.
     """
     for _ in range(STEPS):
         J = now.H.transpose(0, 2, 1) @ now.inverse
-        A = J @ now.H
-        A[:, [0, 1], [0, 1]] *= 1 + damping[:, None]
+        g, A = (J @ now.z[:, :, None]), J @ now.H
         A[:, [0, 1], [0, 1]] += 1e-12
-        step = np.linalg.solve(A, J @ now.z[:, :, None])[:, :, 0]
-        new = fit(now.l + step)
+        left = (g * np.linalg.solve(A, g)).sum(axis=(1, 2))  # what chi-square may become less by
+        if left.max() < settled or (not all_ and left[np.argmin(now.cost)] < settled):
+            break
+        first = _first_of_each(now.l, A)
+        now, damping, g, A = now.of(first), damping[first], g[first], A[first]
+        A[:, [0, 1], [0, 1]] *= 1 + damping[:, None]
+        new = fit(now.l + np.linalg.solve(A, g)[:, :, 0])
         better = np.einsum("ji,jik,jk->j", new.z, now.inverse, new.z) < now.chi2  # Sigma as it was
         damping = np.where(better, 0.1 * damping, 10 * damping)
         now = Fits(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(new, now, strict=True)))
-        settled = np.abs(step).max(axis=1) < SETTLED
-        if settled.all() or (not all_ and settled[np.argmin(now.cost)]):
-            break
     return now, damping
+
+
+def _first_of_each(l: Array, A: Array) -> Index:
+    """Return which positions l (J, 2) are the first of those within TOGETHER sigmas, by information matrices A."""
+    gaps = l - l[:, None]
+    near = np.einsum("ijk,ikm,ijm->ij", gaps, A, gaps) < TOGETHER**2
+    return np.flatnonzero(near.argmax(axis=1) == np.arange(len(l)))
 
 
 def _is_determined(problem: RangeProblem, best: Fits, bent: bool) -> bool:
@@ -237,8 +251,8 @@ def _flat(best: Fits, problem: RangeProblem) -> bool:
     those of the ranges and of the sensor's parameters alone.
     """
     own = problem.own
-    H_x = best.H_x[:, :own]
-    information = best.H.T @ np.linalg.solve(H_x @ problem.S[:own, :own] @ H_x.T + np.diag(best.R), best.H)
+    H_w = best.H_w[:, :own]
+    information = best.H.T @ np.linalg.solve(H_w @ problem.S[0, :own, 0, :own] @ H_w.T + np.diag(best.R), best.H)
     values = np.linalg.eigvalsh(information)
     if not np.isfinite(values).all() or values[0] <= 0:
         return False
