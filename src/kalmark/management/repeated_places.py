@@ -272,7 +272,7 @@ def _grown(look: _Look, T: Array, pairs: Index) -> _Constellation:
         if now == before:
             break
         before = now
-    return _Constellation(T, pairs, _missing(look, T, pairs))
+    return _Constellation(T, pairs, _missing(look, T, pairs) if len(pairs) >= FEWEST else 0)
 
 
 def _agreeing(look: _Look, T: Array, pairs: Index) -> tuple[Index, Index]:
@@ -344,10 +344,15 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     if area <= 0.0:
         return None
     density = m / area
-    alike = max(_self_similarity(look, part) for part in found.pairs.T)
-    chance = max(min(density * math.pi * look.tolerance**2, 1.0), alike)
     edges, few = sum(min(len(near), NEAREST) for near in look.near) / 2, min(1.0, SAMPLE / m)
-    p = 2.0 * edges**2 * float(betainc(few * k - 2, few * (m - k) + 1, chance))
+
+    def false_alarms(chance: float) -> float:
+        return 2.0 * edges**2 * float(betainc(few * k - 2, few * (m - k) + 1, chance))
+
+    chance = min(density * math.pi * look.tolerance**2, 1.0)
+    if false_alarms(chance) > FALSE_ALARMS:
+        return None
+    p = false_alarms(max(chance, *(_self_similarity(look, part) for part in found.pairs.T)))
     if p > FALSE_ALARMS:
         return None
     pairs = found.pairs
