@@ -17,6 +17,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.simulate import load_world, simulate
 
 RANGE_M, RATE_HZ = 8.0, 5.0
+LIMITS = {"range_max_m": RANGE_M, "fov_rad": 4.6}
 
 
 def trees(seed: int, number: int = 60) -> Any:
@@ -60,8 +61,8 @@ def log_of(
     return events
 
 
-def slam_at(start: Any, ids: bool) -> km.Slam:
-    sensor = km.sensors.RangeBearing(sigma_range_m=0.05, sigma_bearing_rad=0.01, range_max_m=RANGE_M, fov_rad=4.6)
+def slam_at(start: Any, ids: bool, limits: dict[str, float] = LIMITS) -> km.Slam:
+    sensor = km.sensors.RangeBearing(sigma_range_m=0.05, sigma_bearing_rad=0.01, **limits)
     motion = km.motion.Odometry2D(sigma_x_m=0.004, sigma_y_m=0.002, sigma_theta_rad=0.003)
     rover = km.Robot("rover", motion, start=start, sensors={"laser": km.Mount(sensor)})
     return km.Slam(rover, association=km.association.ByIdentity() if ids else km.association.Automatic())
@@ -99,6 +100,15 @@ def test_a_robot_that_is_carried_away_is_found(ids: bool, surveyed: str, seed: i
     assert off[:749].max() < 0.8
     assert off[-300:].max() < 0.8
     assert len(slam.landmarks()) <= len(places) + 1
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_robot_is_found_by_a_sensor_whose_limits_are_not_stated(seed: int) -> None:
+    """Its range is counted from its observations; landmarks beyond it contradict no pose."""
+    places, events, poses = carried_log(seed, ids=False)
+    off, carried = errors(slam_at(path(1)[0], ids=False, limits={}), events, poses)
+    assert [gap.robot for gap in carried] == ["rover"]
+    assert off[-300:].max() < 0.8
 
 
 @pytest.mark.parametrize("seed", [4, 5])

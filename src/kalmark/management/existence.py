@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import betaln
 
-from kalmark.arrays import Array, Flags
+from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id
 from kalmark.management.upkeep import Upkeep
 from kalmark.tracks.channel import Channel, ObservationModel
@@ -101,8 +101,7 @@ def look(scan: ScanContext, upkeep: Upkeep) -> Look | None:
         bearing = np.arctan2(v[:, 1], v[:, 0])
         there, hidden = np.array([name in seen for name in names], dtype=np.bool_), _hidden(scan, r, bearing)
         clear = there | ~_unclear(scan, model, names, v, ~there, left)
-        cells = cells_of(r, bearing, hidden)
-        weights = np.where(hidden, 0.0, 1.0) if stated else looks.weights(cells)
+        weights, cells = _weights(looks, upkeep, r, bearing, hidden)
         far = float(r[there].mean()) if there.any() else far
         if usual:
             looks.count(cells[clear], there[clear])
@@ -226,13 +225,26 @@ def _nearest_landmarks(scan: ScanContext, begun: Set[Id]) -> list[tuple[Observat
     ]
 
 
-def expected(scan: ScanContext, of: Known) -> list[Id]:
-    """Return those of landmarks of one kind that are surely in view, and not behind what was observed."""
-    rows, pose = of.nearest(scan.pose()[None, : scan.dimensions], AROUND), scan.pose()
+def log_misses(scan: ScanContext, of: Known, upkeep: Upkeep) -> dict[Id, float]:
+    """Return those of landmarks of one kind that are surely in view, with the log probability that a scan misses each.
+
+    It is that of the filter's own looks; without them nothing is known of it.
+    """
+    looks, pose = scan.tracks.looks.get(scan.key), scan.pose()
+    if looks is None:
+        return {}
+    rows = of.nearest(pose[None, : scan.dimensions], AROUND)
     v = of.model.seen_from(pose, of.values[rows])[0]
-    r, bearing = np.sqrt((v[:, : scan.dimensions] ** 2).sum(axis=1)), np.arctan2(v[:, 1], v[:, 0])
-    sure = _surely(scan.channel, v) & ~_hidden(scan, r, bearing)
-    return [of.names[row] for row in rows[sure].tolist()]
+    sure = _surely(scan.channel, v)
+    r, bearing = np.sqrt((v[sure, : scan.dimensions] ** 2).sum(axis=1)), np.arctan2(v[sure, 1], v[sure, 0])
+    logs = looks.log_miss() * _weights(looks, upkeep, r, bearing, _hidden(scan, r, bearing))[0]
+    return dict(zip([of.names[row] for row in rows[sure].tolist()], logs.tolist(), strict=True))
+
+
+def _weights(looks: Looks, upkeep: Upkeep, r: Array, bearing: Array, hidden: Flags) -> tuple[Array, Index]:
+    """Return what misses at ranges r and bearings (K,) count (K,), 1 where most is seen, and their cells (K, 3)."""
+    cells = cells_of(r, bearing, hidden)
+    return np.where(hidden, 0.0, 1.0) if upkeep.p_detect is not None else looks.weights(cells), cells
 
 
 def _unclear(

@@ -260,8 +260,8 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         fits = {name: k for name, k, fits in zip(names, rows, done.fused.tolist(), strict=True) if fits}
         counts = [name in fits or scan.ids[k] is not None for name, k in zip(names, rows, strict=True)]
         logs = {name: gain for name, gain, yes in zip(names, gains.tolist(), counts, strict=True) if yes}
-    if (looks := scan.tracks.looks.get(scan.key)) is not None and None in scan.ids:
-        logs = dict.fromkeys(existence.expected(view, old), looks.log_miss()) | logs
+    if None in scan.ids:
+        logs = existence.log_misses(view, old, state.policies[scan.key].upkeep) | logs
     of.gain += sum(log for name, log in logs.items() if name not in of.fitted)
     of.fitted |= logs.keys()
     if of.gain - of.ratio >= math.log(ODDS) and fits:
