@@ -68,7 +68,7 @@ def tags(test: int, folder: Path) -> None:
         record(build_slam(c, each), each, progress=False).evaluate() for c, each in ((config, log), (own_config, own))
     )
     print(f"tags, test {test}: {changed} lines edited, {found['landmarks']} tags ({other['landmarks']}), ", end="")
-    print(f"{found['observations']} sightings ({other['observations']}), ", end="")
+    print(f"{found['observations']} observations ({other['observations']}), ", end="")
     print(f"corners {found['corner_rms_px']:.2f} px ({other['corner_rms_px']:.2f})")
 
 

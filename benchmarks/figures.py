@@ -496,7 +496,7 @@ def outliers() -> Iterator[Figure]:
     """Yield how much spurious ranges under right ids do."""
     command = "python benchmarks/outliers.py"
     for case, title in (
-        ("later", "3 % of the ranges anywhere, but not first sightings"),
+        ("later", "3 % of the ranges anywhere, but not first observations"),
         ("any", "3 % of the ranges anywhere"),
     ):
         for way, start in (
@@ -554,7 +554,7 @@ def images() -> Iterator[Figure]:
     errors = "position / attitude / velocity / scale / NEES of the pose, a dof"
     for name, label in (
         ("euroc", "EuRoC V1_01, 90 frames"),
-        ("smoothed", "the same against orientations optimised anew"),
+        ("smoothed", "the same against orientations optimised again"),
     ):
         yield Figure("Images", f"a camera with an inertial unit, {label}, largest of five seeds: {errors}", wanted, unit,
                      row(name, "{0} m / {1} deg / {2} m/s / {3} % / {4}"))  # fmt: skip
@@ -687,7 +687,7 @@ def commands() -> Iterator[Figure]:
     for verb in ("demo", "run"):
         yield Figure("Speed", f"of what `kalmark {verb}` adds, imports, cache, pictures and page alone", "2 s",
                      "python benchmarks/warm.py 9ae1bee", row(f"{verb}, imports, cache,", "{3} s"))  # fmt: skip
-    yield Figure("Speed", "`kalmark run`, warm, on Lost in the Woods, 61,086 sightings: processor time added to the filter's own: here / 9ae1bee / ratio", "2 s",
+    yield Figure("Speed", "`kalmark run`, warm, on Lost in the Woods, 61,086 observations: processor time added to the filter's own: here / 9ae1bee / ratio", "2 s",
                  "python benchmarks/warm.py 9ae1bee", row("run, added:", "{0} s / {3} s / {7}"))  # fmt: skip
     yield Figure("Speed", "page of a long run, of three logs of the plane and KITTI's 3,217 landmarks in space: largest / slowest to open",
                  "10 MB / 2 s", "python benchmarks/pages.py", row("pages:", "{1} MB / {4} s"))  # fmt: skip

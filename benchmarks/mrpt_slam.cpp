@@ -2,7 +2,7 @@
 //
 // All numbers are doubles.  First: landmarks n, method, range of the sensor, sigmas (along, turn, range, bearing), then
 // the state x (3 + 2 n) and its covariance row by row.  Then blocks: a count of steps, each the odometry (3), a number of
-// sightings and for each of them (range, bearing, id).  For each block it answers with the processor's microseconds of
+// observations and for each of them (range, bearing, id).  For each block it answers with the processor's microseconds of
 // each step and the pose (3).
 #include <mrpt/obs/CActionRobotMovement2D.h>
 #include <mrpt/obs/CObservationBearingRange.h>

@@ -36,7 +36,7 @@ class Cost(NamedTuple):
 
 
 def take(slam: km.Slam, steps: Iterable[Step], known: bool, true: dict[Id, int]) -> tuple[np.ndarray, int]:
-    """Take steps; return the milliseconds of each, and how many sightings were taken for another landmark's."""
+    """Take steps; return the milliseconds of each, and how many observations were taken for another landmark's."""
     spent, wrong = [], 0
     for control, with_ids in steps:
         scan = with_ids if known else km.Scan(t_ns=with_ids.t_ns, robot="r", sensor="lidar", y=with_ids.y)
@@ -61,9 +61,9 @@ def cost(side: int, known: bool) -> Cost:
     gc.freeze()
     spent, wrong = take(slam, mission, known, true)
     circle, more = take(slam, field.circle(CIRCLE), known, true)
-    sightings = sum(len(scan.y) for _, scan in mission) + CIRCLE * 10
+    observations = sum(len(scan.y) for _, scan in mission) + CIRCLE * 10
     median = float(np.median(circle[-MEASURED:]))
-    return Cost(float(spent.mean()), median, len(slam.landmarks()), wrong + more, sightings)
+    return Cost(float(spent.mean()), median, len(slam.landmarks()), wrong + more, observations)
 
 
 def main() -> None:

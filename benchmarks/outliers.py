@@ -3,7 +3,7 @@
     python benchmarks/outliers.py                # 20 runs
     python benchmarks/outliers.py --runs 5 --share .1
 
-A robot wanders between 40 landmarks whose ids it knows; some ranges are anywhere: not those of first sightings
+A robot wanders between 40 landmarks whose ids it knows; some ranges are anywhere: not those of first observations
 (`later`), or these, too (`any`).  A line a way: mean pose NEES (3), path and landmark RMSE, and how many landmarks are
 off by more than .5 m.
 """
@@ -33,7 +33,7 @@ WAYS: dict[str, tuple[str, ...]] = {
 
 
 def spurious(log: Log, share: float, later: bool, rng: np.random.Generator) -> Log:
-    """Return a log in which a share of the ranges is anywhere; `later`: not those of a landmark's first sighting."""
+    """Return a log in which a share of the ranges is anywhere; `later`: not those of a landmark's first observation."""
     seen, events = set[object](), []
     for e in log.events:
         event = e

@@ -67,7 +67,7 @@ def mrclam() -> None:
         cells = [f"{np.sqrt(np.mean(c**2)):.4f} ({spread(c):.4f})" for c in all_.T]
         print(f"{length:>6}{len(all_):>9}" + "".join(f"{c:>20}" for c in cells))
     table = np.array(ranges)
-    print(f"{'range m':>10}{'sightings':>11}{'range RMS m':>14}{'bearing RMS rad':>18}")
+    print(f"{'range m':>10}{'observations':>11}{'range RMS m':>14}{'bearing RMS rad':>18}")
     for low in (0, 2, 4, 6):
         near = table[(table[:, 0] >= low) & (table[:, 0] < low + 2) & (np.abs(table[:, 1]) < 1)]
         print(f"{low:>5} to {low + 2}{len(near):>9}{np.std(near[:, 1]):>14.3f}{np.std(near[:, 2]):>18.4f}")

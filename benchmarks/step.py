@@ -119,7 +119,7 @@ def spent_us(call: Callable[..., Any], *arguments: Any) -> float:
 
 
 def dense_over_floor(steps: int) -> dict[str, float]:
-    """Return the median step of a dense map and 6 sightings, and that of the update of its covariance alone."""
+    """Return the median step of a dense map and 6 observations, and that of the update of its covariance alone."""
     field, slam = known_field(SIDE, "dense")
     V = np.full((2 * SIGHTINGS, slam.map.n), 1e-9)
     taken, bare = [], []

@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import argparse
 import ast
+import io
 import math
 import os
 import re
 import subprocess
 import sys
+import tokenize
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from graphlib import CycleError, TopologicalSorter
@@ -32,6 +34,15 @@ LIMITS = ROOT / "docs" / "architecture.md"
 ROW = re.compile(r"^\| (?P<name>[^|]+?) \| (?P<limit>\d+) \|(?P<why>[^|]*)\|$", re.MULTILINE)
 SLACK = 0.002  # of a limit, by which a count may be below it
 QUESTIONS = ("what", "which", "how", "where", "why", "when", "whether")
+FIGURATIVE = re.compile(
+    r"\b(anew|asleep|awake|beyond doubt|believ\w+|blame\w*|foresee\w*|foresight|honest\w*|hopeless|knows?|leans?"
+    r"|leaning|news|says?|said|sick|sight(?:ing|ings|ed)|tells?|told|wakes?|wants?)\b",
+    re.IGNORECASE,
+)
+SUBJECTS = re.compile(  # of sentences, but of no questions
+    r"(?:^|[.:!?]\s+|(?:^|\n)[\s*#|-]+|\n\d\. )\**(What)\b(?![^.?|]*\?)"
+)
+CODE = re.compile(r"```.*?```|`[^`]*`", re.DOTALL)
 PLUGINS = ("bags", "datasets", "diagnosis", "viewer", "vision")
 IMPORTS = ("import_module", "__import__")
 WHOLE = re.compile(r"\b(State|Slam|Estimate)\b")  # the types of the slam and its state
@@ -144,6 +155,22 @@ def texts(nodes: Iterable[ast.AST]) -> Iterator[str]:
     yield from (str(n.value) for n in nodes if isinstance(n, ast.Constant) and isinstance(n.value, str))
 
 
+def prose() -> Iterator[str]:
+    """Yield the texts and comments of the sources and the pages of the documentation, without the code in them."""
+    for file in modules().values():
+        source = file.read_text()
+        yield from (CODE.sub("", text) for text in texts(ast.walk(ast.parse(source))) if " " in text)
+        tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+        yield from (token.string for token in tokens if token.type == tokenize.COMMENT)
+    for page in (*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")):
+        yield CODE.sub("", page.read_text())
+
+
+def figures_of_speech(text: str) -> list[str]:
+    """Return the words of a text that make a person of a thing or that the glossary replaces, and subjects "What"."""
+    return [*(match[0] for match in FIGURATIVE.finditer(text)), *SUBJECTS.findall(text)]
+
+
 def branches(node: ast.AST) -> int:
     """Return the branch points below a node: also conditional expressions, `and`, `or`, comprehensions, handlers."""
     number = 0
@@ -215,6 +242,7 @@ def counts() -> dict[str, int]:
     found["syntax nodes of the core"] = sum(1 for tree in core for _ in ast.walk(tree))
     heads = [text.lower().split()[0] for tree in trees for text in docstrings(tree) if text.strip()]
     found["docstrings that begin with a question word"] = sum(head in QUESTIONS for head in heads)
+    found["words that the glossary replaces, sentences of `What`"] = sum(len(figures_of_speech(t)) for t in prose())
     homes = Counter(node.name for tree in trees for node in tree.body if isinstance(node, Function))
     found["functions of modules that share their name"] = sum(n for n in homes.values() if n > 1)
     found["file names used more than once"] = sum(n for n in stems.values() if n > 1)

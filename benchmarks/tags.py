@@ -4,8 +4,8 @@
 
 One line a test, shipped configuration.  `filter`: RMS of the corners' distances from where the filter has them just
 after each scan.  `past path`: the filter's path as it was then, with the map and the mounts it ended with, which early
-poses do not know.  `batch`: bundle adjustment of the same sightings.  `raw`: position RMSE against TagSLAM's own batch
-result, which is fitted to these detections.  `s`: processor time of the filter.
+poses do not know.  `batch`: bundle adjustment of the same observations.  `raw`: position RMSE against TagSLAM's own
+batch result, which is fitted to these detections.  `s`: processor time of the filter.
 """
 
 from __future__ import annotations

@@ -42,8 +42,8 @@ def errors(name: str, seed: int) -> dict[Id, dict[int, tuple[Array, float]]]:
             continue
         renderer, T = event.image.args[:2]  # type: ignore[union-attr]
         depth = renderer.render(T)[1]
-        assert front_end.sighting is not None
-        scan = front_end.sighting.scan
+        assert front_end.observation is not None
+        scan = front_end.observation.scan
         R = sensor.noise(report.y) if scan.cov is None else np.asarray(scan.cov)
         for o in report.observations:
             if o.landmark is None or o.outcome not in ("new", "associated"):

@@ -5,7 +5,7 @@
 
 The medians of five new processes each; the first ones, which compile, do not count.  A part's time is without that of
 parts inside it.  `log` is the simulation of the demo, which other verbs read from a file; it is not counted as added.
-The real log is Lost in the Woods, 61,086 sightings in 21 minutes; `KALMARK_DATA` names its folder.
+The real log is Lost in the Woods, 61,086 observations in 21 minutes; `KALMARK_DATA` names its folder.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ class FullProducts(TextbookSlam):
     """The textbook filter as most who write one do: P <- (I - K H) P, a full product for every landmark."""
 
     def correct(self, i: int, y: Any, gate: float = np.inf) -> bool:
-        """Correct with the sighting y = (range, bearing) of landmark i."""
+        """Correct with the observation y = (range, bearing) of landmark i."""
         e, H = self.expect(i)
         z = np.asarray(y) - e
         z[1] = wrap(z[1])
@@ -156,7 +156,7 @@ class SparseProducts(TextbookSlam):
         self.P[3:, :3] = self.P[:3, 3:].T
 
     def correct(self, i: int, y: Any, gate: float = np.inf) -> bool:
-        """Correct with the sighting y = (range, bearing) of landmark i."""
+        """Correct with the observation y = (range, bearing) of landmark i."""
         seen = np.array([0, 1, 2, 3 + 2 * i, 4 + 2 * i])
         e, E_r, E_l = observe(self.x[:3], self.x[seen[3:]])
         E = np.hstack([E_r, E_l])

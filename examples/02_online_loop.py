@@ -20,7 +20,7 @@ def drive(v: float, w: float, dt: float) -> None:
     truth = km.motion.Unicycle().move(truth, np.array([v, w]) + rng.normal(size=2) * [0.05, 0.03], dt)[0]
 
 
-def sightings() -> tuple[list[np.ndarray], list[int]]:
+def observations() -> tuple[list[np.ndarray], list[int]]:
     """Stand in for the lidar and its detector: range (m), bearing (rad) and identity of the posts within 5 m."""
     y, _, _ = km.geometry.observe(truth, np.array(list(POSTS.values())))
     seen = [(m + rng.normal(size=2) * [0.05, 0.01], i) for m, i in zip(y, POSTS, strict=True) if m[0] < 5]
@@ -40,7 +40,7 @@ for t in np.arange(0.0, 20.0, 0.1):
     v, w = 0.5, 0.3
     slam.process(km.Control(t_s=t, robot="rover", u=(v, w)))  # holds until the next one
     drive(v, w, 0.1)
-    y, ids = sightings()
+    y, ids = observations()
     report = slam.process(km.Scan(t_s=t + 0.1, robot="rover", sensor="lidar", y=y, ids=ids))
     for observation in report.observations:
         if observation.outcome == "rejected":

@@ -97,7 +97,7 @@ def robot(cov: Any = None, start: Any = None) -> km.Robot:
     return km.Robot("r", km.motion.Odometry3D(0.01, 0.01, 0.01, 0.005), start, {"lidar": lidar}, cov)
 
 
-def sightings(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def observations(truth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     y = expectation(truth, MOUNT, km.sensors.RangeBearing3D(), km.landmarks.Point3D(), WORLD)[0]
     return y + rng.normal(size=y.shape) * NOISE
 
@@ -107,7 +107,7 @@ def drive(slam: km.Slam, steps: int, seed: int, truth: np.ndarray) -> np.ndarray
     for t in range(1, steps + 1):
         truth = odometry.move(truth, U, 0.0)[0]
         slam.process(km.Control(t, "r", U + rng.normal(size=6) * SIGMAS))
-        slam.process(km.Scan(t, "r", "lidar", sightings(truth, rng), range(12)))
+        slam.process(km.Scan(t, "r", "lidar", observations(truth, rng), range(12)))
     return truth
 
 
@@ -120,7 +120,7 @@ def test_a_robot_that_stands_still_in_space_learns_nothing_of_its_orientation(es
     prior = np.diag([0.5, 0.5, 0.5, *np.radians([20, 20, 20])]) ** 2
     slam = km.Slam([robot(prior)], km.association.ByIdentity("off"), estimator)
     for t in range(100):
-        slam.process(km.Scan(t, "r", "lidar", sightings(truth, rng), range(12)))
+        slam.process(km.Scan(t, "r", "lidar", observations(truth, rng), range(12)))
     sigmas = np.degrees(np.sqrt(np.diag(slam.covariance("r"))[3:]))
     if learns:
         assert sigmas.min() < 15
@@ -142,7 +142,7 @@ def test_rotating_the_world_rotates_the_estimate_about_any_axis() -> None:
     turn = exp(np.array([0.7, -1.1, 0.4]))
     a, b = km.Slam([robot()]), km.Slam([robot(start=np.concatenate([np.zeros(3), turn]))])
     for slam, start in ((a, ORIGIN), (b, ORIGIN)):
-        drive(slam, 40, 6, start)  # the same controls and sightings: they are in the robot's frame
+        drive(slam, 40, 6, start)  # the same controls and observations: they are in the robot's frame
     Q = matrix(turn)
     for i in range(12):
         np.testing.assert_allclose(Q @ a.mean(i), b.mean(i), atol=1e-9)

@@ -96,7 +96,7 @@ class Field:
 
 
 def mapped(slam: km.Slam, events: Sequence[Event], of: dict[int, list[int]]) -> dict[object, int]:
-    """Filter events; return what most sightings of each landmark of the map are of."""
+    """Filter events; return what most observations of each landmark of the map are of."""
     votes: dict[object, Counter[int]] = defaultdict(Counter)
     for event in events:
         report = slam.process(event)

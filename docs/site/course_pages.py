@@ -107,7 +107,7 @@ def table(all_items: list[Item], pages: dict[str, str]) -> str:
         "# Every item of the four documents\n",
         "Each section, equation, figure, table, program, exercise, slide and option of the",
         "[four documents](../learn.md), with its state here. *works*: kalmark does it, and the page shows it.",
-        "*partly*: a part of it, or no page shows it. *missing*: kalmark does not have it; the row says why.",
+        "*partly*: a part of it, or no page shows it. *missing*: kalmark does not have it; the row has the reason.",
         "A page of their own has the [figures of the documents](figures.md), drawn by kalmark.\n",
         "| document | " + " | ".join(STATES) + " | items |\n|---|---|---|---|---|",
     ]

@@ -9,7 +9,7 @@ Robots share one map: each has a name, in every event, and the covariance has al
 # Two robots and a post
 # ---------------------
 #
-# Only ``alpha`` knows where it starts. ``beta`` is somewhere within two metres.
+# Only the start of ``alpha`` is known. ``beta`` is somewhere within two metres.
 import matplotlib.pyplot as plt
 import numpy as np
 

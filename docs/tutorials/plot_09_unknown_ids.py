@@ -2,7 +2,7 @@
 Landmarks without ids
 =====================
 
-A sensor seldom identifies its landmarks. The association decides which landmark each observation is of, and says why.
+A sensor seldom identifies its landmarks. The association decides which landmark each observation is of, and gives the reason.
 """
 
 # %%

@@ -7,8 +7,8 @@ stays as it was: it is never fused silently at the wrong time.
 """
 
 # %%
-# What is refused
-# ---------------
+# Refused events
+# --------------
 import heapq
 
 import matplotlib.pyplot as plt

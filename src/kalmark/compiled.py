@@ -3,9 +3,9 @@
 numba checks only the file of the function itself when it looks for a stored version, not the files of what that
 function calls.  A folder therefore carries a digest of the sources: an edit or an upgrade starts afresh.
 
-What one compiled function calls is compiled into it once more.  Where that would cost much, or where not all of it is
-ever needed, the call goes `by_address` instead: the callee is compiled once, alone, and only when it is used.  The
-filter calls the models so, hence its code does not depend on theirs: each has a folder of its own.
+The functions that a compiled function calls are compiled into it once more.  Where that would cost much, or where not
+all of it is ever needed, the call goes `by_address` instead: the callee is compiled once, alone, and only when it is
+used.  The filter calls the models so, hence its code does not depend on theirs: each has a folder of its own.
 
 Each file of compiled code ends with the SHA-256 of its name and content.  One that is damaged or cut, or
 another one under its name, counts as none and is made again: what numba would take out of it might do anything.

@@ -428,7 +428,7 @@ def own_name(model: type) -> str:
 def load_plugin(file: Path) -> ModuleType:
     """Run a Python file of the user's, unless it is imported already, and return it.
 
-    What it registers is known from then on.  Raises KalmarkError if it cannot be run.
+    Models that it registers are known from then on.  Raises KalmarkError if it cannot be run.
     """
     file = file.resolve()
     if file not in _PLUGINS:

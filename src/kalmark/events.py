@@ -36,7 +36,7 @@ _SHORT = 2**63  # ids that need no second look
 MOST = {"m": 1e9, "mps": 1e6, "rad": 1e6, "radps": 1e6, "px": 1e9}
 """The largest magnitudes that mean anything, by unit: m, m/s, rad, rad/s and pixels.
 
-What is larger leaves no digits for the rest of a map: a double that holds 1e9 m resolves 1e-7 m.
+A larger number leaves no digits for the rest of a map: a double that holds 1e9 m resolves 1e-7 m.
 """
 MOST_OTHER = 1e12  # of what has no unit, or another one: signatures, logarithms, a user's own
 SYMBOLS = {"mps": "m/s", "radps": "rad/s"}

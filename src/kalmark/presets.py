@@ -4,9 +4,10 @@
     km.Mount(laser.sensor); laser.rate_hz; laser.dropouts; laser.sources["range_max_m"]
 
 A data sheet's accuracy is taken as one sigma.  Where a source gives a width and no noise (the lobe of a sonar), the
-noise is that of a uniform distribution over it, the width by the square root of 12.  What follows from a source by some
-steps is derived in docs/presets.md; what has none is called an assumption there and in `sources`.  `dropouts` is the
-probability that something in view is not reported: worlds take it, and the rate, from a sensor's `preset`.
+noise is that of a uniform distribution over it, the width by the square root of 12.  A number that follows from a
+source by some steps is derived in docs/presets.md; one without a source is called an assumption there and in `sources`.
+`dropouts` is the probability that something in view is not reported: worlds take it, and the rate, from a sensor's
+`preset`.
 """
 
 from __future__ import annotations

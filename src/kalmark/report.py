@@ -164,7 +164,7 @@ class Repeat(NamedTuple):
 
     `middle` (2,) [m] is that of the newer ones, `shift` (2,) [m] what they are off by there.  `score` is the
     log-likelihood ratio of all pairs against chance, `p` how many such repeats are expected by chance in this map.
-    `agrees`: the map's own covariance lets them be one.  `sure`: beyond doubt, by shape alone.  `newer` are all
+    `agrees`: the map's own covariance lets them be one.  `sure`: accepted by shape alone.  `newer` are all
     landmarks of the newer part.
 
     >>> pairs = [(1, 21), (2, 22), (3, 23)]

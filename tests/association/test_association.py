@@ -35,7 +35,7 @@ def pairwise_m(points: np.ndarray) -> np.ndarray:
 
 
 def seen_from(truth: np.ndarray, points: np.ndarray, cov: np.ndarray, method: object, seen: list[int]) -> list[object]:
-    """Return what becomes of sightings of the points `seen` from a pose that is believed to be the origin."""
+    """Return what becomes of observations of the points `seen` from a pose that is believed to be the origin."""
     mount = km.Mount(km.sensors.Position2D(0.02))
     robot = km.Robot("r", km.motion.Odometry2D(), start=ORIGIN, cov=cov, sensors={"s": mount})
     slam = km.Slam([robot], method)  # type: ignore[arg-type]

@@ -88,7 +88,7 @@ def weighed(experience: float, just: bool) -> tuple[Posterior, np.ndarray]:
     return posterior(together, np.arange(2), d2, d2 <= gate(0.99, 2), seen, *search), seen
 
 
-def test_sightings_of_landmarks_just_seen_make_more_of_them_likely_and_say_nothing_about_older_ones() -> None:
+def test_observations_of_landmarks_just_seen_make_more_of_them_likely_and_say_nothing_about_older_ones() -> None:
     neither, old = weighed(0.0, just=False)
     tracked, _ = weighed(30.0, just=False)
     assert tracked.none() == pytest.approx(neither.none()), "what is tracked says nothing about older ones"

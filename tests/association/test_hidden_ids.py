@@ -46,7 +46,7 @@ def test_the_filter_is_not_told_and_the_summary_says_how_often_it_was_wrong(tmp_
     run = run_of(log)
     summary = run.evaluate()
     assert summary["landmarks"] == 3
-    assert (summary["wrong"], summary["judged"]) == (2, 30)  # twelve scans, two tentative sightings of each
+    assert (summary["wrong"], summary["judged"]) == (2, 30)  # twelve scans, two tentative observations of each
     assert (summary["duplicates"], summary["nameless"], summary["nameless_fused"]) == (0, 12, 0)
     assert summary["landmark_rmse_raw_m"] < 0.02, "landmarks are held against the truth by the log's names"
     run.save(tmp_path / "run")

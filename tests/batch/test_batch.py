@@ -39,7 +39,7 @@ LANDMARKS = np.array([[3.0, 1.0], [2.0, -2.0], [-1.0, 3.0], [5.0, 4.0]])
 SIGMA = np.array([0.1, 0.03])
 
 
-def sighting(pose: Array, target: Array, rng: np.random.Generator, noise: float = 1.0) -> Array:
+def observation(pose: Array, target: Array, rng: np.random.Generator, noise: float = 1.0) -> Array:
     T = compose(pose, MOUNT)[0]
     d = target - T[:2]
     return np.array([np.hypot(*d), wrap(np.arctan2(d[1], d[0]) - T[2])]) + noise * SIGMA * rng.normal(size=2)
@@ -78,7 +78,7 @@ def odometry_log(steps: int = 12, noise: float = 1.0) -> tuple[list[Event], list
         events.append(Control(k + 1.0, "r", u))
         links.append(Link(k, u, np.diag(sigma)[:, [0, 2]], [2 * k, 2 * k + 1]))
         ids = [i for i in range(4) if rng.random() < 0.7 or k == 0]
-        y = np.array([sighting(truth, LANDMARKS[i], rng, noise) for i in ids]).reshape(-1, 2)
+        y = np.array([observation(truth, LANDMARKS[i], rng, noise) for i in ids]).reshape(-1, 2)
         events.append(Scan(k + 1.0, "r", "lidar", y, ids=ids))
         sights += [Sight(k + 1, i, row, SIGMA, MOUNT) for i, row in zip(ids, y, strict=True)]
     return events, links, sights, truth
@@ -143,7 +143,7 @@ def test_a_held_error_shared_by_the_parts_of_a_split_control_equals_dense_least_
         white += len(parts)
         links.append(link(len(links) - 1, motion_of, errors))
         truth = compose(truth, motion_of(rng.normal(size=len(errors))))[0]
-        y = np.array([sighting(truth, l, rng) for l in LANDMARKS])
+        y = np.array([observation(truth, l, rng) for l in LANDMARKS])
         events.append(Scan(t, "r", "lidar", y, ids=range(4)))
         sights += [Sight(len(links) - 1, i, row, SIGMA, MOUNT) for i, row in enumerate(y)]
         nodes.append(len(links) - 1)
@@ -167,7 +167,7 @@ def test_robots_that_sight_each_other_equal_dense_least_squares() -> None:
             events.append(Control(k + 1.0, name, u))
             links.append(Link(at[i], u, np.diag([sigma[0], 0, sigma[1]])[:, [0, 2]], [errors, errors + 1]))
             at[i], errors = len(links) - 1, errors + 2
-        y = [sighting(truth[0], l, rng) for l in LANDMARKS[:3]] + [sighting(truth[0], truth[1][:2], rng)]
+        y = [observation(truth[0], l, rng) for l in LANDMARKS[:3]] + [observation(truth[0], truth[1][:2], rng)]
         events.append(Scan(k + 1.0, "a", "lidar", y, ids=[0, 1, 2, "b"]))
         sights += [Sight(at[0], j, row, SIGMA, MOUNT) for j, row in enumerate(y[:3])]
         sights.append(Sight(at[0], -1 - at[1], y[3], SIGMA, MOUNT))

@@ -71,7 +71,7 @@ class Tags:
 
 
 def scene(rng: np.random.Generator, poses: int = 40, count: int = 8) -> tuple[Seen, Array, Array]:
-    """Return perfect sightings of tags about the plane z = 0, from a rig that passes them, its true poses, the tags."""
+    """Return perfect observations of tags about the plane z = 0, from a rig that passes them, its poses, the tags."""
     l = np.array([frames3d.plus(np.eye(7)[6], d) for d in rng.normal(size=(count, 6)) * [0.7, 0.5, 0.2, 0.3, 0.3, 1]])
     x = np.linspace(-0.7, 0.7, poses)
     r = np.stack([x, 0.4 * np.sin(4 * x), -1.5 + 0 * x, *(0 * x,) * 3, 1 + 0 * x], axis=1)
@@ -234,7 +234,7 @@ def test_what_is_not_determined_or_not_in_view_is_refused(rng: np.random.Generat
         adjust(seen, r, shaken(l, rng, 0.03), iterations=1)
 
 
-def test_a_filter_of_corners_ends_near_the_optimum_of_its_own_sightings(rng: np.random.Generator) -> None:
+def test_a_filter_of_corners_ends_near_the_optimum_of_its_own_observations(rng: np.random.Generator) -> None:
     seen, r, l = scene(rng, poses=60)
     y = noisy(seen, rng).y
     sensors = {name: km.Mount(c, at=at) for name, c, at in zip(("left", "right"), cameras(SIGMA), MOUNTS, strict=True)}

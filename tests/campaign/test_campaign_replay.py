@@ -1,4 +1,4 @@
-"""Replays: a log's own route and sightings, noise drawn again: consistent where the filter is, the same for a seed."""
+"""Replays of a log's route and observations with new noise: consistent where the filter is, the same for a seed."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ ROWS = [f"{0.1 * k:.1f},r,lidar,7,{3 - 0.05 * max(0, k - 6):.3f},0.0,0.2,0.1" fo
 SCANS = ["t_s,robot,sensor,id,range_m,bearing_rad,sigma_range_m,sigma_bearing_rad", *ROWS]
 
 
-def test_noise_of_the_logs_own_fixes_and_rejected_sightings_are_the_logs(tmp_path: Path) -> None:
+def test_noise_of_the_logs_own_fixes_and_rejected_observations_are_the_logs(tmp_path: Path) -> None:
     scans = [*SCANS, "1.9,r,lidar,8,2.0,1.0,0.2,0.1"]
     scans[15] = "1.4,r,lidar,7,30.0,0.0,0.2,0.1"  # far outside the gate
     fixes = "t_s,robot,x_m,y_m,cov_xx,cov_xy,cov_yy\n1.0,r,0.2,0.0,0.04,0.0,0.04\n"

@@ -32,7 +32,7 @@ def scans(log: Log, robot: str | None = None) -> list[Scan]:
     return [event for event in log if isinstance(event, Scan) and robot in (None, event.robot)]
 
 
-def sightings(log: Log, robot: str | None = None) -> Counter:
+def observations(log: Log, robot: str | None = None) -> Counter:
     return Counter(id_ for scan in scans(log, robot) for id_ in scan.ids)
 
 
@@ -46,7 +46,7 @@ def dead_reckoning(log: Log) -> np.ndarray:
     return np.array(path)
 
 
-D6 = {  # odometry rows, sightings of landmarks, of robots, of nobody, truth rows
+D6 = {  # odometry rows, observations of landmarks, of robots, of nobody, truth rows
     1: (61_785, 1_534, 407, 1, 49_241),
     2: (65_005, 3_239, 792, 0, 59_705),
     3: (61_158, 4_348, 1_277, 2, 56_977),
@@ -61,8 +61,8 @@ def test_mrclam_6_has_its_counts(n: int, data: Data) -> None:
     log = opened(data("mrclam/MRCLAM_Dataset6"), robots=n)
     assert log.format == "mrclam" and log.robots == (f"robot{n}",)
     assert len(controls(log)) == odometry
-    assert sum(sightings(log).values()) == landmarks
-    assert set(sightings(log)) == set(log.landmarks) == set(range(6, 21))
+    assert sum(observations(log).values()) == landmarks
+    assert set(observations(log)) == set(log.landmarks) == set(range(6, 21))
     assert len(log.truth[f"robot{n}"]) == truth
     dropped = {"robot": 0, "barcode": 0}
     for line in log.skipped:
@@ -73,12 +73,12 @@ def test_mrclam_6_has_its_counts(n: int, data: Data) -> None:
 
 def test_mrclam_robots_that_sight_each_other_are_named(data: Data) -> None:
     log = opened(data("mrclam/MRCLAM_Dataset6"), robots=(4, 1))
-    seen = sightings(log, "robot4")
+    seen = observations(log, "robot4")
     assert seen["robot1"] > 0 and not {"robot2", "robot3", "robot5"} & set(seen)
     assert log.robots == ("robot1", "robot4")
     assert [sort_key(event) for event in log] == sorted(sort_key(event) for event in log)
     alone = opened(data("mrclam/MRCLAM_Dataset9"), robots=5, robot_sightings=False)
-    assert all(isinstance(id_, int) for id_ in sightings(alone))
+    assert all(isinstance(id_, int) for id_ in observations(alone))
     assert any("robot_sightings is false" in line for line in alone.skipped)
 
 
@@ -129,7 +129,7 @@ def test_mrclam_9_can_be_read_without_its_bad_rows(data: Data) -> None:
     counts = {1: 10_193, 2: 9_099, 3: 9_253, 4: 4_510, 5: 10_102}
     unknown = {1: 1, 5: 1}
     for n, count in counts.items():
-        assert sum(sightings(log, f"robot{n}").values()) == count - unknown.get(n, 0)
+        assert sum(observations(log, f"robot{n}").values()) == count - unknown.get(n, 0)
     assert sum("run backwards" in line for line in log.skipped) == 4
     assert [line.split(": ")[1] for line in log.skipped if "barcode" in line] == [
         "1 of barcode 52, which no subject carries"
@@ -146,7 +146,7 @@ def test_mrclam_8_has_no_odometry_and_says_so(data: Data) -> None:
     by_robot = [605, 894, 1_973, 819, 1_294]
     listed = [line.split(": ")[1] for line in log.skipped if "barcode 61" in line]
     assert listed == [f"{count} of barcode 61, which no subject carries" for count in by_robot]
-    total = sum(sightings(log).values()) + sum(
+    total = sum(observations(log).values()) + sum(
         int(line.split(": ")[1].split()[0]) for line in log.skipped if "barcode" in line
     )
     assert total == 14_129 + 19_880 + 23_634 + 12_264 + 24_032
@@ -162,7 +162,7 @@ def test_mrclam_refuses_a_robot_it_does_not_have(data: Data) -> None:
 def test_lost_in_the_woods_has_its_counts(data: Data) -> None:
     log = opened(data("lost_in_the_woods"))
     assert log.format == "lost_in_the_woods"
-    assert len(controls(log)) == 12_609 and sum(sightings(log).values()) == 61_086
+    assert len(controls(log)) == 12_609 and sum(observations(log).values()) == 61_086
     assert set(log.landmarks) == set(range(1, 18))
     seen = [scan for scan in scans(log) if len(scan.y)]
     assert all((scan.y[:, 0] > 0).all() for scan in seen)
@@ -191,7 +191,7 @@ def test_freiburg_has_its_counts_and_its_odometry(data: Data) -> None:
     log = opened(data("freiburg_course"))
     assert log.format == "freiburg_course"
     assert len(controls(log)) == 331
-    assert sum(sightings(log).values()) + len(log.skipped) == 1_212
+    assert sum(observations(log).values()) + len(log.skipped) == 1_212
     assert log.skipped == [f"{log.path}:1541: range is -0.035065641258, expected a range of at least 0"]
     assert len(log.landmarks) == 9
     assert np.allclose(dead_reckoning(log)[-1], (5.06, 4.89, -4.72), atol=0.01)
@@ -215,7 +215,7 @@ def test_victoria_park_has_its_counts(steering: str, rows: int, data: Data) -> N
     log = opened(data("victoria_park"), steering=steering)
     assert log.format == "victoria_park"
     assert len(controls(log)) == rows
-    assert sum(sightings(log).values()) == 46_860 and len(scans(log)) == 7_122 and len(sightings(log)) == 299
+    assert sum(observations(log).values()) == 46_860 and len(scans(log)) == 7_122 and len(observations(log)) == 299
     assert len(log.gps["car"]) == 4_466 and log.gps["car"].antenna.tolist() == [3.78, 0.5]
     assert np.allclose(log.gps["car"].xy[0], (-67.649, -41.714), atol=1e-3)
     assert controls(log)[0].t_ns == 21_940_000_000
@@ -260,7 +260,7 @@ def test_victoria_park_has_the_beams_and_the_trees_of_another_program(data: Data
 
 def test_dlr_has_its_counts(data: Data) -> None:
     log = opened(data("dlr/map.circles"))
-    seen = sightings(log)
+    seen = observations(log)
     assert log.format == "dlr"
     assert len(controls(log)) == 3_297 and sum(seen.values()) == 14_745
     assert seen[None] == 436 and len(seen) - 1 == 576

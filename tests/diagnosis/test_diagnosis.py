@@ -591,7 +591,7 @@ def test_an_id_on_two_things_is_named() -> None:
 
 
 @pytest.mark.parametrize("gate", ["default", "off"])
-def test_wrong_ids_are_named_and_bend_the_map_only_where_all_sightings_are_used(gate: str) -> None:
+def test_wrong_ids_are_named_and_bend_the_map_only_where_all_observations_are_used(gate: str) -> None:
     exact = (f"{SIGMA}=0.03", "robots.rover.sensors.lidar.sigma_bearing_rad=0.004", f"filter.association.gate={gate}")
     rng, made = np.random.default_rng(0), world_of(*exact)
 

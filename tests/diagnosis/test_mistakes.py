@@ -75,8 +75,12 @@ def cured(log: Log, mistake: Mistake) -> Log:
 
 
 CASES: dict[str, tuple[Change, str, str]] = {
-    "mirrored": (measuring(lambda y: y * [1.0, -1.0]), "bearing_sign", "clockwise.*cannot tell.*turns of rover"),
-    "turns": (controlling((1.0, -1.0)), "bearing_sign", "cannot tell.*turns of rover"),
+    "mirrored": (
+        measuring(lambda y: y * [1.0, -1.0]),
+        "bearing_sign",
+        "clockwise.*does not distinguish.*turns of rover",
+    ),
+    "turns": (controlling((1.0, -1.0)), "bearing_sign", "does not distinguish.*turns of rover"),
     "degrees": (measuring(lambda y: y * [1.0, 180 / np.pi]), "units", "rover.lidar.*degrees"),
     "millimetres": (measuring(lambda y: y * [1e3, 1.0]), "units", "rover.lidar.*millimetres"),
     "ways": (controlling((1e3, 1.0)), "units", "controls of rover.*millimetres"),

@@ -12,7 +12,7 @@ import pytest
 import kalmark as km
 from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import replay_events
-from kalmark.batch.problem import sightings
+from kalmark.batch.problem import observation_factor
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.batch_search import associated
 from kalmark.diagnosis.causes import Finding
@@ -143,7 +143,7 @@ def test_the_turn_of_a_mount_matches_differences(name: str, options: tuple[str, 
             else:
                 turned = compose(at, np.array([0.0, 0.0, step]))[0]
             view = view_of(mount.sensor, given.landmark, turned)
-            other = sightings(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor)
+            other = observation_factor(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor)
             moved.append(other.term.at(problem.start)[0])
         parts[f] = (moved[1] - moved[0]) / (2 * h)
         np.testing.assert_allclose(turn, linear.whitened(parts), rtol=1e-4, atol=1e-4 * np.abs(turn).max())

@@ -24,7 +24,7 @@ PLACES = {
 
 
 def history(ids: list[str], rejected: str = "") -> History:
-    """Return the history of sightings of these ids, those of one of them rejected."""
+    """Return the history of observations of these ids, those of one of them rejected."""
     outcome = ["rejected" if name == rejected else "associated" for name in ids]
     return cast("History", SimpleNamespace(id=np.array(ids), outcome=np.array(outcome)))
 
@@ -35,10 +35,10 @@ def history(ids: list[str], rejected: str = "") -> History:
         (["a"] * 9 + ["a (2)"] * 9, "", GONE),
         (["a", "a (2)"] * 9, "", TWO),
         (["a"] * 9 + ["a (2)"] * 9, "a (2)", MOVES),
-        (["a (2)"] * 9, "", GONE),  # no sighting is of where it was given
+        (["a (2)"] * 9, "", GONE),  # no observation is of where it was given
     ],
 )
-def test_sightings_in_their_order_show_what_an_id_means(ids: list[str], rejected: str, meaning: str) -> None:
+def test_observations_in_their_order_show_what_an_id_means(ids: list[str], rejected: str, meaning: str) -> None:
     assert _told(history(ids, rejected), PLACES, "a") == meaning
 
 
@@ -53,7 +53,7 @@ def test_ids_of_one_meaning_are_said_together_whatever_their_letters() -> None:
     assert _together(told) == "ids 1, {2} are on two things each; what is called 3 is where {2} was"
 
 
-def test_sightings_of_one_robot_are_renamed_and_not_those_of_another_with_such_a_sensor() -> None:
+def test_observations_of_one_robot_are_renamed_and_not_those_of_another_with_such_a_sensor() -> None:
     scans = [Scan(t_s=1.0, robot=robot, sensor="eye", y=np.ones((1, 2)), ids=["a"]) for robot in ("r", "s")]
     h: Any = SimpleNamespace(
         t_ns=np.array([scans[0].t_ns] * 2),

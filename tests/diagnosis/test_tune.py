@@ -90,7 +90,7 @@ def test_a_mount_that_is_turned_is_found_and_its_noise_is_left(tmp_path: Path) -
 
 def test_a_scale_of_ranges_that_the_odometry_may_have_instead_is_left_and_it_is_said(tmp_path: Path) -> None:
     one = change(tune(written(tmp_path, scale=1.06)), SENSOR + "scale")
-    assert not one.changed and "does not tell it from" in one.why
+    assert not one.changed and "does not distinguish it from" in one.why
 
 
 def test_a_key_that_does_not_help_the_second_part_is_left(tmp_path: Path) -> None:

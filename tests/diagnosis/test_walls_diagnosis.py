@@ -48,7 +48,7 @@ CASES: dict[str, tuple[dict[str, Any], str, str]] = {
     "noise": ({"sigma_m": 0.008}, "distance_sigma", "2.5"),
     "offset": ({"change": measuring(0, 0.05)}, "range_offset", "distances of robot.walls are 0.05"),
     "turned": ({"change": measuring(1, -math.radians(10.0), 15.0)}, "mount", "from t=15.* turned by 1?[0-9.]* deg"),
-    "wheels": ({"change": turns}, "odometry_turn", "turns [78].* too much"),
+    "wheels": ({"change": turns}, "odometry_turn", "is [78].* too large"),
 }
 
 

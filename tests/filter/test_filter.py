@@ -255,7 +255,7 @@ def test_rotating_the_world_rotates_the_estimate() -> None:
 
 
 def test_augmenting_is_the_limit_of_a_huge_prior_with_a_difference_falling_as_one_over_C() -> None:
-    """Tacher 3: a landmark with prior C I, corrected by its first sighting, against augmentation."""
+    """Tacher 3: a landmark with prior C I, corrected by its first observation, against augmentation."""
     differences = []
     for C in (1e2, 1e3, 1e4):
         y = np.array([3.0, 0.4])

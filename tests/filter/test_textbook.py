@@ -47,7 +47,7 @@ def analytic_move(x: np.ndarray, n: np.ndarray, u: np.ndarray) -> tuple[np.ndarr
     return np.concatenate([r, x[3:]]), F_x, F_n
 
 
-def sighting(x: np.ndarray, n: np.ndarray, i: int) -> np.ndarray:
+def observation(x: np.ndarray, n: np.ndarray, i: int) -> np.ndarray:
     return np.asarray(km.geometry.observe(x[:3], x[3 + 2 * i : 5 + 2 * i])[0] + n)
 
 
@@ -58,7 +58,7 @@ def landmark(x: np.ndarray, n: np.ndarray, y: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("f", [numeric_move, analytic_move])
 def test_the_extended_filter_with_a_map_as_its_state_is_the_guides_ekf_slam(f: object) -> None:
     rng, start = np.random.default_rng(2), np.diag([0.1, 0.1, 0.05]) ** 2
-    ekf = km.textbook.ExtendedKalmanFilter(f, sighting, Q, R, x=[0, 0, 3.1], Sigma=start, angles=[2], angles_y=[1])
+    ekf = km.textbook.ExtendedKalmanFilter(f, observation, Q, R, x=[0, 0, 3.1], Sigma=start, angles=[2], angles_y=[1])
     book = km.textbook.TextbookSlam(start=[0, 0, 3.1], Q=Q, R=R, P=start)
     for y in ([3.0, 0.6], [4.0, -0.3]):
         ekf.augment(landmark, R, np.array(y))
@@ -77,7 +77,7 @@ def test_the_extended_filter_with_a_map_as_its_state_is_the_guides_ekf_slam(f: o
 
 def test_differences_of_an_angle_do_not_jump_by_a_turn() -> None:
     ekf = km.textbook.ExtendedKalmanFilter(
-        numeric_move, sighting, Q, R, x=[0, 0, np.pi, -3, 0], Sigma=np.diag([0.1, 0.1, 0.05, 1, 1]),
+        numeric_move, observation, Q, R, x=[0, 0, np.pi, -3, 0], Sigma=np.diag([0.1, 0.1, 0.05, 1, 1]),
         angles=[2], angles_y=[1],
     )  # fmt: skip
     book = km.textbook.TextbookSlam(start=[0, 0, np.pi], Q=Q, R=R)

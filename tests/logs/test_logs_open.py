@@ -41,11 +41,11 @@ def test_events_come_in_the_one_order(folder: Path) -> None:
     ]
 
 
-def test_robots_that_were_not_asked_for_are_left_out_with_their_sightings(folder: Path) -> None:
+def test_robots_that_were_not_asked_for_are_left_out_with_their_observations(folder: Path) -> None:
     log = open_log(folder, robots=["a"])
     assert log.robots == ("a",) and {event.robot for event in log} == {"a"}
     assert [scan.ids for scan in log if isinstance(scan, Scan)] == [(1,)]
-    assert log.skipped == [f"{folder}: 2 sightings of b, which was not asked for"]
+    assert log.skipped == [f"{folder}: 2 observations of b, which was not asked for"]
     assert [records_of(line) for line in log.skipped] == [2]
     assert list(log.sensor_columns) == [("a", "s")]
 

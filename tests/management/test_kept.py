@@ -1,4 +1,4 @@
-"""Sightings of tentative landmarks are kept with their poses, and fused when the landmark is confirmed."""
+"""Observations of tentative landmarks are kept with their poses, and fused when the landmark is confirmed."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def test_a_map_that_waited_is_that_of_one_that_was_told_from_the_start(postponed
         figures[poses] = float(np.median(worse)), float(e @ np.linalg.solve(P, e))
     assert figures[20][0] == pytest.approx(1.0, abs=0.005)
     assert figures[20][1] < 0.05, "a tenth of a sigma: it is linearised later"
-    assert figures[0][0] > 1.02, "the sightings between the first and the last are lost"
+    assert figures[0][0] > 1.02, "the observations between the first and the last are lost"
 
 
-def test_poses_stay_honest_with_sightings_that_were_kept() -> None:
+def test_poses_stay_honest_with_observations_that_were_kept() -> None:
     nees = []
     for seed in range(20):
         slam, (events, truth) = slam_of(KEEPS), drive(60, seed)
@@ -96,7 +96,7 @@ def test_poses_are_removed_when_nothing_waits_and_when_they_are_too_many() -> No
         slam.process(event)
         poses = slam.clones.of(("r", "camera"))
         kept = {m.clone for track in slam.tracks.tentative.values() for m in track.measurements}
-        assert kept == set(poses), "no pose without a sighting, no sighting without its pose"
+        assert kept == set(poses), "no pose without an observation, no observation without its pose"
         most = max(most, len(poses))
     assert most == 3
 

@@ -44,7 +44,7 @@ def test_what_pairs_gain_depends_on_those_before_them() -> None:
     assert doubtful_pairs(found, 0, 2.0) == []
 
 
-def test_one_sighting_of_a_place_long_unseen_is_held_back_and_several_together_are_not() -> None:
+def test_one_observation_of_a_place_long_unseen_is_held_back_and_several_together_are_not() -> None:
     _, reports = carried_off(slam_of(), GARDEN[:1])
     first = reports[0].observations[0]
     assert first.outcome == "deferred"

@@ -1,4 +1,4 @@
-"""A sighting without an id is tentative until it was seen again and again, and does not pull the pose until then."""
+"""A landmark without an id is tentative until it was observed several times, and does not pull the pose before."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def test_a_tentative_landmark_does_not_pull_the_pose(map_: str) -> None:
     np.testing.assert_array_equal(slam.covariance("cart"), blind.covariance("cart"))
 
 
-def test_no_sighting_is_counted_twice() -> None:
-    """The covariance is what two sightings tell, the first one and the one that confirmed it."""
+def test_no_observation_is_counted_twice() -> None:
+    """The covariance is what two observations tell, the first one and the one that confirmed it."""
     slam, plain = orchard(), orchard()
     y = [[[5.0, 0.2]], [[5.04, 0.21]], [[4.97, 0.19]]]
     for t, each in enumerate(y):
@@ -112,7 +112,7 @@ def test_clutter_does_not_get_into_the_map(association: object) -> None:
     assert len(once.landmarks()) > 2 * len(TREES), "without it there is much that is not there"
 
 
-def test_a_known_id_is_a_landmark_at_once_beside_sightings_without_one() -> None:
+def test_a_known_id_is_a_landmark_at_once_beside_observations_without_one() -> None:
     slam = orchard()
     report = slam.process(km.Scan(0, "cart", "lidar", [[5.0, 0.2], [7.0, -0.4]], ids=[17, None]))
     assert [(o.outcome, o.landmark) for o in report.observations] == [("new", 17), ("tentative", "u1")]

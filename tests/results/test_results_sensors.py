@@ -91,12 +91,12 @@ def test_a_camera_shows_what_it_did_not_measure() -> None:
     camera = run.history.cameras[0]
     step = int(run.history.unmeasured_step[run.history.unmeasured_sensor == "eye"][-1])
     (image,) = images(run.history, camera, step)
-    missed = [s for s in image.sightings if s.outcome == IN_VIEW]
+    missed = [s for s in image.observations if s.outcome == IN_VIEW]
     assert missed
-    for sighting in missed:
-        assert sighting.measured.shape == (0, 2)
-        assert np.isfinite(sighting.expected).all()
-        assert np.isfinite(sighting.Z).all()
+    for observation in missed:
+        assert observation.measured.shape == (0, 2)
+        assert np.isfinite(observation.expected).all()
+        assert np.isfinite(observation.Z).all()
     assert "predicted only" in str([t.get_text() for t in draw_sensor(run, "r", "eye", step).legends[0].get_texts()])
 
 

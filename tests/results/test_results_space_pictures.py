@@ -134,10 +134,10 @@ def test_the_image_shows_what_was_used_and_what_was_rejected(run: Run) -> None:
     steps = np.unique(run.history.step[(run.history.outcome == "rejected") & (run.history.sensor == "eye")])
     assert len(steps), "the wrong landmark comes into sight"
     (image,) = images(run.history, camera, int(steps[0]))
-    by_name = {s.name: s for s in image.sightings}
+    by_name = {s.name: s for s in image.observations}
     assert by_name[str(WRONG)].outcome == "rejected"
     assert np.linalg.norm(by_name[str(WRONG)].measured - by_name[str(WRONG)].expected) > 50
-    used = [s for s in image.sightings if s.outcome == "associated"]
+    used = [s for s in image.observations if s.outcome == "associated"]
     assert all(np.isfinite(s.Z).all() and np.linalg.norm(s.measured - s.expected) < 12 for s in used)
     figure = draw_sensor(run, "rover", "eye", step=int(steps[0]))
     (axes,) = figure.axes
@@ -177,8 +177,8 @@ def test_any_camera_s_measurements_are_points_of_its_images(run: Run, columns: A
     history = replace(history, unmeasured_step=np.full_like(history.unmeasured_step, -1))
     seen = images(history, camera, int(history.step[-1]))
     assert [image.side for image in seen] == sides
-    assert all(s.measured.shape == s.expected.shape == (points, 2) for image in seen for s in image.sightings)
-    assert np.isfinite(seen[0].sightings[0].Z).all() == (points == 1)
+    assert all(s.measured.shape == s.expected.shape == (points, 2) for image in seen for s in image.observations)
+    assert np.isfinite(seen[0].observations[0].Z).all() == (points == 1)
     assert len(draw_sensor(replace(run, history=history), "rover", "eye").axes) == len(sides)
 
 

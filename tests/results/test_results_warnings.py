@@ -161,7 +161,7 @@ def test_of_a_noise_that_is_far_too_large_it_is_advised_by_how_much_and_of_a_rig
     line = only(advised(log, 2.3, 2.3))
     factors = re.fullmatch(
         r"sensor lidar: NIS 0\.(19|2|21) where 1 is expected: its sigma is stated about (\S+) times \(range_m\), "
-        r"(\S+) times \(bearing_rad\) too large, unless its errors last from one sighting to the next",
+        r"(\S+) times \(bearing_rad\) too large, unless its errors last from one observation to the next",
         line,
     )
     assert factors is not None, line

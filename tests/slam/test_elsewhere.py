@@ -144,7 +144,7 @@ def test_the_onset_is_found_although_the_way_led_through_an_empty_place_first() 
 
 
 def test_two_things_with_one_id_and_one_that_drives_about_bend_no_map() -> None:
-    """With ids and no gate: a far sighting is left out while the others of its scan fit."""
+    """With ids and no gate: a far observation is left out while the others of its scan fit."""
     places, poses = trees(7), path(2)
     events = log_of(poses, places, 7, True)
     other, moving = int(np.argmax(np.linalg.norm(places - places[0], axis=1))), 5

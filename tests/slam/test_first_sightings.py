@@ -1,4 +1,4 @@
-"""A landmark with an id that an outlier began is begun again where later sightings have it."""
+"""A landmark with an id that an outlier began is begun again where later observations have it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def errors(slam: km.Slam) -> dict[int, float]:
 
 @pytest.mark.parametrize("how", WAYS, ids=["student", "huber", "gate"])
 @pytest.mark.parametrize("wrong", [[5], [3, 5]])
-def test_an_outlier_at_first_sight_costs_three_sightings(how: dict[str, Any], wrong: list[int]) -> None:
+def test_an_outlier_at_first_sight_costs_three_observations(how: dict[str, Any], wrong: list[int]) -> None:
     slam = slam_of(**how)
     removed = drive(slam, 20, {(0, name): MISSES for name in wrong})
     assert sorted(removed) == [(name, ELSEWHERE, 3) for name in wrong]
@@ -69,7 +69,7 @@ def test_outliers_later_begin_nothing(how: dict[str, Any]) -> None:
     assert not slam.state.tracks.tentative
 
 
-def test_a_landmark_that_was_moved_is_where_most_of_its_sightings_have_it() -> None:
+def test_a_landmark_that_was_moved_is_where_most_of_its_observations_have_it() -> None:
     there = {5: (5.5, -0.6)}
     slam = slam_of(**GATED)
     assert drive(slam, 25, {}, (15, there)) == []

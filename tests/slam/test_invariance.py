@@ -38,7 +38,7 @@ def test_rotating_the_world_rotates_the_estimate(name: str, kind: str, keys: tup
     world = load_world(name, ["steps=20", *filter_, f"filter.estimator.iterations={iterations}", *keys])
     log, Q = simulate(world, 1), matrix(exp(TURN))
     here, there = build_slam(world.config(), log), build_slam(world.config(), log)
-    for robot in there.robots.values():  # the same controls and sightings: they are in the robot's frame
+    for robot in there.robots.values():  # the same controls and observations: they are in the robot's frame
         slot = there.slot(robot.name)
         there.map.set_predicted(slot, robot.motion.space.rotated(there.map.mean(slot), TURN))
     for event in log:

@@ -215,7 +215,7 @@ def test_robots_that_see_each_other_share_what_they_know(estimator: Any) -> None
     assert me.reason == "a robot does not see itself"
 
 
-def test_a_sighted_robot_is_moved_to_the_time_of_the_sighting() -> None:
+def test_an_observed_robot_is_moved_to_the_time_of_the_observation() -> None:
     camera = {"camera": km.Mount(km.sensors.RangeBearing())}
     slam = km.Slam([km.Robot(n, km.motion.Unicycle(), (x, 0, 0), camera) for n, x in (("a", 0), ("b", 3))])
     slam.process(km.Control(0, "b", (1.0, 0.0)))

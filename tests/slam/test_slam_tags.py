@@ -1,4 +1,4 @@
-"""Tags seen by their corners, end to end: mirror images, sightings far from what is expected, what is left of them."""
+"""Tags seen by their corners: mirror images, observations far from their expectation, their residuals."""
 
 from __future__ import annotations
 

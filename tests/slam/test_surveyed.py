@@ -47,7 +47,7 @@ def test_a_wrong_survey_is_left_out_with_a_reason_then_mapped_anew(cov: Any, gat
     slam, right = surveyed(cov, WRONG, gate), surveyed(cov, {}, gate)
     pose, removed = drive(slam, 20)
     drive(right, 20)
-    assert removed == [(3, ELSEWHERE, 4)]  # five sightings
+    assert removed == [(3, ELSEWHERE, 4)]  # five observations
     assert not slam.is_known(3)
     assert np.linalg.norm(slam.mean(3) - PLACES[3]) < 4 * np.sqrt(np.trace(slam.covariance(3))) < 0.5
     assert np.linalg.norm(slam.mean("r")[:2] - pose[:2]) < 0.1
@@ -85,7 +85,7 @@ def test_one_landmark_alone_is_left_out_until_others_say_the_same() -> None:
     np.testing.assert_allclose(slam.mean("r")[:3], there, atol=0.3)
 
 
-def test_a_survey_on_trial_is_trusted_after_five_sightings_that_fit_and_kept_in_a_file(tmp_path: Path) -> None:
+def test_a_survey_on_trial_is_trusted_after_five_observations_that_fit_and_kept_in_a_file(tmp_path: Path) -> None:
     slam = surveyed(0.01 * np.eye(2), {})
     drive(slam, 4)
     assert slam.state.surveys.trial == dict.fromkeys(PLACES, 4)

@@ -1,11 +1,11 @@
-"""Surveyed landmarks whose sightings do not fit: the landmark stands elsewhere, or the robot is elsewhere."""
+"""Surveyed landmarks whose observations do not fit: the landmark stands elsewhere, or the robot is elsewhere."""
 
 from __future__ import annotations
 
 from kalmark.tracks.surveys import MISFITS, TRUSTED, Surveys
 
 
-def test_a_landmark_of_which_five_sightings_misfit_while_two_others_fit_stands_elsewhere() -> None:
+def test_a_landmark_of_which_five_observations_misfit_while_two_others_fit_stands_elsewhere() -> None:
     surveys = Surveys()
     for k in range(MISFITS):
         assert surveys.wrong() == []
@@ -23,7 +23,7 @@ def test_one_landmark_that_fits_is_not_enough_against_it() -> None:
     assert surveys.wrong() == ["a"], "b and c have fitted meanwhile"
 
 
-def test_a_sighting_that_fits_ends_the_row() -> None:
+def test_an_observation_that_fits_ends_the_row() -> None:
     surveys = Surveys()
     for _ in range(MISFITS - 1):
         surveys.judge("r", ["b", "c"], ["a"])
@@ -36,18 +36,18 @@ def test_a_sighting_that_fits_ends_the_row() -> None:
 def test_two_misfits_with_nothing_between_that_fits_are_the_robot_s() -> None:
     surveys = Surveys()
     assert [surveys.judge("r", [], [name]) for name in "aab"] == [False, False, True]
-    assert surveys.misfits == {} and surveys.strangers["r"] == set()
+    assert surveys.misfits == {} and surveys.misfitting["r"] == set()
     assert surveys.judge("r", [], ["b"]) is False, "it begins again"
 
 
-def test_a_sighting_that_fits_between_two_misfits_or_another_robot_s_does_not_count_together() -> None:
+def test_an_observation_that_fits_between_two_misfits_or_another_robot_s_does_not_count_together() -> None:
     surveys = Surveys()
     assert [surveys.judge("r", fit, off) for fit, off in (([], ["a"]), (["c"], []), ([], ["b"]))] == [False] * 3
     surveys = Surveys()
     assert [surveys.judge(robot, [], [name]) for robot, name in (("r", "a"), ("s", "b"))] == [False, False]
 
 
-def test_five_sightings_that_fit_end_the_trial_of_a_survey() -> None:
+def test_five_observations_that_fit_end_the_trial_of_a_survey() -> None:
     surveys = Surveys()
     surveys.trial["a"] = 0
     for k in range(1, TRUSTED):
@@ -72,4 +72,4 @@ def test_a_landmark_that_is_forgotten_is_nowhere_any_more() -> None:
     surveys.trial["a"] = 1
     surveys.judge("r", [], ["a"])
     surveys.forget("a")
-    assert (surveys.trial, surveys.misfits, surveys.strangers) == ({}, {}, {"r": set()})
+    assert (surveys.trial, surveys.misfits, surveys.misfitting) == ({}, {}, {"r": set()})

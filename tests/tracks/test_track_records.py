@@ -73,7 +73,7 @@ def test_a_landmark_with_another_block_and_model_leaves_its_old_slot() -> None:
     assert np.flatnonzero(wanted[sorts]).tolist() == [7]
 
 
-def test_two_that_are_one_have_all_sightings_of_both_and_the_fewer_misses_in_a_row() -> None:
+def test_two_that_are_one_have_all_observations_of_both_and_the_fewer_misses_in_a_row() -> None:
     tracks = tracks_of("a", "b", "c", "d")
     tracks.note_scan(["a", "c"])
     tracks.note_scan(["b", "d"])

@@ -61,8 +61,8 @@ def noise_of_matches(slam: km.Slam, pictures: list[np.ndarray], **beside: np.nda
     for k, image in enumerate(pictures):
         more = {name: image if name == "right" else one for name, one in beside.items()}
         slam.process(km.Frame(0.1 * k, "camera", "eye", image, **more))
-        sighting = slam.state.sources["camera", "eye"].sighting  # type: ignore[attr-defined]
-        R.append(np.asarray(sighting.scan.cov))
+        observation = slam.state.sources["camera", "eye"].observation  # type: ignore[attr-defined]
+        R.append(np.asarray(observation.scan.cov))
     return R
 
 

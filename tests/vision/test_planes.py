@@ -57,7 +57,7 @@ def test_matches_show_a_slanted_wall_and_its_points_do_not_move_once_it_is_known
         for T, image in zip(path[1:], images[1:], strict=True):
             looks = predict_templates(cv2, views, [*planes], places, T, CAMERA, 6)
             e = CAMERA.expect(to_frame_many(T, places)[0])[0]
-            some = looks.told[np.isfinite(e[looks.told]).all(axis=1)]
+            some = looks.valid[np.isfinite(e[looks.valid]).all(axis=1)]
             found, scores = Searcher(cv2, image, looks.templates, 0.85).in_discs(some, e[some], np.full(len(some), 4.0))
             for k, at, score in zip(some.tolist(), found, scores, strict=True):
                 if learns and score >= 0.85:

@@ -70,7 +70,7 @@ def test_a_patch_is_found_to_a_tenth_of_a_pixel_where_it_appears_from_elsewhere(
     facing = [Surroundings(view.rays[4]) for (view,) in views]
     looks = predict_templates(cv2, views, facing, places, then, camera, 6)
     true = pixels(camera, then, places)
-    inside = looks.told[((true > 25) & (true < np.array(now.shape[::-1]) - 25))[looks.told].all(axis=1)]
+    inside = looks.valid[((true > 25) & (true < np.array(now.shape[::-1]) - 25))[looks.valid].all(axis=1)]
     assert len(inside) > 12
     radius = 12.0 if large else 4.0
     e = true[inside] + rng.uniform(-radius / 2, radius / 2, (len(inside), 2))

@@ -2,7 +2,7 @@ r"""
 [S] 2.3.2: the robot moves
 ==========================
 
-Only the robot moves, so the Jacobian of the motion is the identity for all landmarks, [S] (11) to (13). What remains
+Only the robot moves, so the Jacobian of the motion is the identity for all landmarks, [S] (11) to (13). The rest
 of the prediction [S] (9) and (10) are the sparse equations [S] (14) to (17):
 
 .. math::

@@ -67,6 +67,6 @@ plt.show()
 # ------------
 #
 # * The landmark: ``i, P = 1, slam.P.copy()``. The second landmark was started from this very pose, so its measurement
-#   says nothing new about the robot: only the landmark's own rows of K and P are not zero.
+#   has no information about the robot: only the landmark's own rows of K and P are not zero.
 # * The motion: remove ``slam.predict([1.0, 0.3])``. The robot is known exactly and no landmark is correlated with
 #   another: again only the landmark's own part changes.

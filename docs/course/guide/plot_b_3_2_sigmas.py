@@ -9,7 +9,7 @@ The Mahalanobis distance counts in sigmas, [S] (83). The points at distance :mat
 
    (x - \bar x)^\top P^{-1} (x - \bar x) = n^2
 
-Table 3 says how often a draw lies inside. A filter uses it as a gate: the program of the guide refuses a measurement
+Table 3 has the share of draws inside. A filter uses it as a gate: the program of the guide refuses a measurement
 whose innovation is outside its 3-sigma ellipse.
 """
 

@@ -42,8 +42,8 @@ def drive(gets, gate=9.0, mistaken=np.inf):
 
 
 # %%
-# What is left of the map
-# -----------------------
+# The map after it
+# ----------------
 #
 # Ellipses are of 3 sigma. The mistake pulls the end of the round to the wrong place; the ellipses there do not hold the
 # landmarks any more. The largest error of a landmark grows from 1.6 m to 3.6 m.

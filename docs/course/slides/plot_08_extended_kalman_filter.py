@@ -20,7 +20,7 @@ the slides linearize both. Each line of Algorithm 11.3 then has a Jacobian in pl
 # ----------
 #
 # The state is angle and angular rate. The noise :math:`n` is an acceleration; what is measured is the height of the
-# weight, which does not tell the side. ``f`` returns its value, and its Jacobians are found by differences; ``g``
+# weight, which does not determine the side. ``f`` returns its value, and its Jacobians are found by differences; ``g``
 # returns them itself.
 import matplotlib.pyplot as plt
 import numpy as np
@@ -54,8 +54,8 @@ for i in range(120):
 # Angle and rate
 # --------------
 #
-# The band is 2 sigma. The rate is never measured. At the lowest point :math:`G_x` is zero, and the measurement tells
-# nothing; it is the motion that carries the estimate through.
+# The band is 2 sigma. The rate is never measured. At the lowest point :math:`G_x` is zero, and the measurement has
+# no information; it is the motion that carries the estimate through.
 t, angle, rate, s_angle, s_rate, true_angle, true_rate = np.array(rows).T
 print(f"last sigmas: {s_angle[-1]:.3f} rad, {s_rate[-1]:.3f} rad/s")
 figure, axes = plt.subplots(2, 1, figsize=(8, 5), layout="constrained", sharex=True)

@@ -76,6 +76,6 @@ plt.show()
 # ------------
 #
 # * A landmark that is not observed: ``seen`` = [0, 1, 3] and groups without 3. Its columns of :math:`G_x` are empty,
-#   and its mean stays; it is not updated, as the slides say.
+#   and its mean stays; it is not updated, as in the slides.
 # * A worse pose: ``np.diag([0.5, 0.5]) ** 2`` as ``Sigma_n``. The order counts more, since the first correction
 #   moves the point at which the next is linearized by more: the sigmas of the heading differ by 0.0007 rad, not 0.0001.

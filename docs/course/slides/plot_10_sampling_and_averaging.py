@@ -38,8 +38,8 @@ drawn = np.random.default_rng(2).choice(2, size=1000, p=weights)
 print("weights", weights.round(3), "average", x.round(3), "drawn:", np.bincount(drawn))
 
 # %%
-# What each way keeps
-# -------------------
+# Results of the three ways
+# -------------------------
 #
 # Dotted is the position before, red after, at 2 sigma; crosses are the landmarks. The best matching has a small
 # covariance, and is wrong with the probability 0.36. A drawn one has too; the width of the lines is its probability.
@@ -60,6 +60,6 @@ plt.show()
 # ------------
 #
 # * An observation in the middle: ``y = np.array([1.5, 0.0])``. Both weights are 0.5. With 0.4 they are 0.91 and 0.09.
-# * A prior that knows more: ``np.diag([0.3, 0.1]) ** 2``. One matching has the weight 0.99; the three ways agree.
+# * A narrower prior: ``np.diag([0.3, 0.1]) ** 2``. One matching has the weight 0.99; the three ways agree.
 # * A scan of kalmark is answered so by ``km.Slam([robot], km.association.Averaged())`` and
 #   ``km.association.Sampled()``.

@@ -58,7 +58,7 @@ for name in ("surgery", "no cross-covariance", "pose taken as exact"):
 # The covariance after the start
 # ------------------------------
 #
-# One landmark, seen from one place, says nothing about where the robot is in the world. With the right
+# One landmark, seen from one place, has no information about where the robot is in the world. With the right
 # surgery the sigmas of the pose stay 0.5 m, 0.3 m and 0.1 rad. In the other two they fall, though nothing was measured.
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), layout="constrained")
 for ax, (name, Sigma) in zip(axes, pictures.items(), strict=True):

@@ -37,7 +37,7 @@ print("alpha, beta and the camera of beta:", P.shape)
 #
 # A range begins a Euclidean point, a pixel one with an unknown depth. The camera corrects both kinds, and a
 # landmark whose depth has become known is made Euclidean. The mount is found on the way: what ``alpha`` has measured
-# to centimetres tells where the camera of ``beta`` is.
+# to centimetres determines where the camera of ``beta`` is.
 figure = plt.figure(figsize=(11, 4.2), layout="constrained")
 ax = figure.add_subplot(1, 3, 1, projection="3d")
 kinds, mount = figure.add_subplot(1, 3, 2), figure.add_subplot(1, 3, 3)

@@ -26,8 +26,8 @@ for event in log.events:
     report = slam.process(event)
 
 # %%
-# What the structures hold
-# ------------------------
+# Content of the structures
+# -------------------------
 #
 # ``Rob.frame.x`` and ``.P`` are the robot's mean and covariance, ``Lmk.state`` those of a landmark, ``Map`` all of them
 # together. ``Obs`` is what ``expect`` returns: ``exp.e``, ``inn.Z`` and the Jacobians ``E_r``, ``E_s`` and ``E_l``.

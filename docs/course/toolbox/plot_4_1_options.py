@@ -2,7 +2,7 @@ r"""
 [TB] 4.1: options of the correction
 ===================================
 
-``Opt.correct`` of the toolbox has how a frame is fused: whether landmarks are projected anew after each correction
+``Opt.correct`` of the toolbox has how a frame is fused: whether landmarks are projected again after each correction
 (``reprojectLmks``), how many of them correct (``nUpdates``), and the gate (``MD2th``). In kalmark these are the
 estimator's type, the ``attention`` of a sensor and the association's ``gate``; the other fields are in :doc:`/toolbox`.
 """

@@ -51,7 +51,7 @@ plt.show()
 # ------------
 #
 # The first two are the same function of nearly the same numbers, and their curves are one. The homogeneous point has no
-# anchor, and its sigma is larger and its NEES nearer to 6. :doc:`/bearing_only` says why it keeps the covariance
+# anchor, and its sigma is larger and its NEES nearer to 6. :doc:`/bearing_only` shows why it keeps the covariance
 # consistent.
 
 # %%

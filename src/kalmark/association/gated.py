@@ -190,7 +190,7 @@ class JointCompatibility(Gated):
         gates = np.array([0.0, *(chi2_gate(self.gate, z.shape[1] * (n + 1)) for n in range(len(d2)))])
         chosen, finished = best_matching(first, columns, z, Z, more, gates, self.most_nodes)
         pairs[order] = np.where(chosen >= 0, columns[chosen], -1)
-        why = "it does not fit with the others" + ("" if finished else f", as far as {self.most_nodes} nodes tell")
+        why = "it does not fit with the others" + ("" if finished else f", by a search of {self.most_nodes} nodes")
         return Matched(pairs, dict.fromkeys(range(len(d2)), why))
 
 

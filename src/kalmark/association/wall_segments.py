@@ -1,4 +1,4 @@
-"""Extents of walls: observations on the line of a wall whose ends do not meet the part of it that is known.
+"""Extents of walls: observations on the line of a wall whose segment does not join its known segment.
 
 Two walls of a corridor with a door between them are on one line, which their measurements fit alike.
 """

@@ -184,8 +184,8 @@ def leaves(kind: str, definitions: Mapping[str, Any], before: str = "", depth: i
 def landmark_fields(kind: str, definitions: Mapping[str, Any]) -> dict[str, str]:
     """Return the fields of landmarks in a type of messages: an id with a position, or with a range, a bearing or both.
 
-    Told by the names of the fields: elements of an array, arrays of one length, or the message itself; {} if there are
-    none.
+    Recognised by the names of the fields: elements of an array, arrays of one length, or the message itself; {} if
+    there are none.
     """
     groups: dict[str, dict[str, str]] = {}
     for path, base in leaves(kind, definitions):

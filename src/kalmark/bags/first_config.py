@@ -290,7 +290,7 @@ class _Writer:
         if topic.offers.image is not None:
             return IMAGES_ADVICE
         if topic.offers.pose is not None or topic.offers.twist is not None:
-            return "if it is `truth` or a `fix`, say so"
+            return "if it is a truth or a fix, set its type"
         return "no type of message that kalmark reads"
 
     def clock(self, topics: Sequence[TopicSummary], out: _Lines) -> None:

@@ -312,7 +312,7 @@ def rig_increments(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
 def scans_of(received: Messages, cameras: dict[str, str], scene: Scene, bag: Path, request: Request) -> list[Scan]:
     """Return the scans of the cameras, by topic, in order of time: corners in TagSLAM's order and the size of each tag.
 
-    What is left out is counted by its reason.
+    Frames that are left out are counted by their reason.
     """
     left_out: Counter[str] = Counter()
     scans = []

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, BatchState, Ints, unsolvable_problem
 from kalmark.batch.motion_chain import Chain, Starts
-from kalmark.batch.problem import Block, Factor, Problem, motionless, positions, sightings
+from kalmark.batch.problem import Block, Factor, Problem, motionless, observation_factor, positions
 from kalmark.batch.wall_anchors import anchors
 from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event, sort_events
 from kalmark.geometry.frames import compose
@@ -76,7 +76,7 @@ class BatchInput:
 
     Without `motion` each pose is on its own, but for those that share landmarks: of each such part without a landmark
     that is known exactly the first pose is held.  `mounts`, by robot and sensor, are the means of those that are not
-    known: solved for where another sensor has observations at the same pose, else held.  Sightings with whitened
+    known: solved for where another sensor has observations at the same pose, else held.  Observations with whitened
     residuals beyond `huber` count less.
 
     `biases` are the constants (c,) of the controls of a robot.
@@ -146,13 +146,13 @@ def without_lags(given: BatchInput, events: Iterable[Event]) -> tuple[BatchInput
 
 
 class BatchReplay:
-    """Replays the events and gathers nodes, motions and sightings."""
+    """Replays the events and gathers nodes, motions and observations."""
 
     def __init__(self, given: BatchInput) -> None:
         self.given, self.known = given, given.known
         self.chain = Chain(given.robots if given.motion else {}, given.starts, given.biases)
         self.apart: dict[tuple[str, int], int] = {}  # nodes without motion, by robot and time
-        self.sighted: dict[tuple[str, str, int], list[BatchObservation]] = {}  # by robot, sensor and group
+        self.observed: dict[tuple[str, str, int], list[BatchObservation]] = {}  # by robot, sensor and group
         self.fixes: list[tuple[int, Array, Array]] = []
         self.fixed = 0  # fixes so far, with those that do not count
         self.nodes: list[int] = []
@@ -182,9 +182,9 @@ class BatchReplay:
         other = copy(self)
         associations = replace(self.given.associations, landmark=landmark)
         other.given = replace(self.given, associations=associations, poses=poses, landmarks=landmarks)
-        other.sighted = {
+        other.observed = {
             key: [one._replace(target=landmark[one.row]) for one in seen] if key[2] == LANDMARKS else seen
-            for key, seen in self.sighted.items()
+            for key, seen in self.observed.items()
         }
         return other
 
@@ -251,7 +251,7 @@ class BatchReplay:
             target, group = used.landmark[row], LANDMARKS
             if isinstance(target, str) and target in self.given.robots:
                 target, group = self._node(target, scan.t_ns), POSES
-            self.sighted.setdefault((scan.robot, scan.sensor, group), []).append(
+            self.observed.setdefault((scan.robot, scan.sensor, group), []).append(
                 BatchObservation(node, target, y, R_row, row)
             )
 
@@ -288,7 +288,7 @@ class BatchReplay:
             poses, motion = np.empty((len(self.apart), size)), motionless(size)
             poses[nodes] = given.poses
         values = np.array([self._value(name, poses) for name in names]).reshape(-1, space.size)
-        seen, mounts = self._sightings({name: k for k, name in enumerate(names)})
+        seen, mounts = self._observations({name: k for k, name in enumerate(names)})
         spaces = (POSE_SPACES[size], space, *(mount_space(size) for _ in mounts))
         state = BatchState(spaces, (poses, values, *(mean[None] for mean in mounts)))
         exactly = np.array([name in self.known and self.known[name][1] is None for name in names], dtype=np.bool_)
@@ -307,7 +307,7 @@ class BatchReplay:
     def _names(self) -> list[Id]:
         """Return the landmarks.  One that was measured by fewer numbers than it has is left out."""
         numbers: dict[Id, int] = {}
-        for (_, _, group), seen in self.sighted.items():
+        for (_, _, group), seen in self.observed.items():
             for one in seen if group == LANDMARKS else ():
                 if one.target is not None:
                     numbers[one.target] = numbers.get(one.target, 0) + len(one.R)
@@ -315,10 +315,10 @@ class BatchReplay:
         least = 2 if walls else self.given.landmark.space.dof
         return [name for name, k in numbers.items() if k >= least or name in self.known]
 
-    def _sightings(self, at: Mapping[Id | None, int]) -> tuple[list[Factor], list[Array]]:
+    def _observations(self, at: Mapping[Id | None, int]) -> tuple[list[Factor], list[Array]]:
         """Return what each sensor saw and the means of the mounts to be solved for, in the order of their groups."""
         given, kept = self.given, {}
-        for (robot, sensor, group), seen in self.sighted.items():
+        for (robot, sensor, group), seen in self.observed.items():
             if given.robots[robot].sensors[sensor].cov is not None and (robot, sensor) not in given.mounts:
                 raise unsolvable_problem(f"mount '{robot}.{sensor}' is in the map, expected mounts that are known")
             rows = [(*one[:1], at.get(one.target, -1) if group == LANDMARKS else one.target, *one[2:4]) for one in seen]
@@ -338,13 +338,13 @@ class BatchReplay:
                 blocks.insert(1, Block(groups[robot, sensor], np.zeros_like(node), mount_space(size)))
             view = view_of(mount.sensor, landmark, mean)
             huber = given.huber if mount.robust is None else min(given.huber, huber_length(R.shape[1]))
-            factors.append(sightings(view, tuple(blocks), y, R, huber, (robot, sensor)))
+            factors.append(observation_factor(view, tuple(blocks), y, R, huber, (robot, sensor)))
         return factors, [np.array(given.mounts[name], dtype=np.float64) for name in groups]
 
     def _anchors(self, seen: list[Factor], state: BatchState) -> tuple[list[Factor], Ints]:
         """Return the factors of where the anchors of walls are along them, and which landmarks are points.
 
-        It is where the start has them, from the pose of their first sighting.
+        It is where the start has them, from the pose of their first observation.
         """
         found, points = [], np.ones(len(state.groups[LANDMARKS]), dtype=np.bool_)
         for factor in seen:
@@ -371,7 +371,7 @@ class BatchReplay:
         return [positions(group, *(np.array(c) for c in zip(*rows, strict=True))) for group, rows in given if rows]
 
     def _value(self, name: Id, poses: Array) -> Array:
-        """Return where the map, or else its first sighting, puts a landmark."""
+        """Return where the map, or else its first observation, puts a landmark."""
         if name in self.known or name in self.given.landmarks:
             mean = np.asarray((self.known if name in self.known else self.given.landmarks)[name][0], dtype=np.float64)
             size = self.given.landmark.space.size
@@ -382,7 +382,7 @@ class BatchReplay:
                     f"landmark {str(name)!r} is at {mean.tolist()}, expected a point of {size} finite numbers"
                 )
             return mean
-        for (robot, sensor, _), seen in self.sighted.items():
+        for (robot, sensor, _), seen in self.observed.items():
             mount = self.given.robots[robot].sensors[sensor]
             for node, landmark, y, *_ in seen:
                 if landmark == name and isinstance(mount.sensor, FullSensor):
@@ -394,7 +394,7 @@ class BatchReplay:
 
 
 def _first_poses(seen: list[Factor], n: int, exactly: Flags) -> Ints:
-    """Return the first pose of each part of the sightings that no landmark connects with the others, or with the world.
+    """Return the first pose of each part of the observations that no landmark connects with the others, or the world.
 
     Landmarks known `exactly` (m,) are of the world.
     """

@@ -123,7 +123,7 @@ class Factor:
         return self.term.hessian(state, lambda z: np.einsum("kij,kj->ki", weights, z))
 
 
-def sightings(
+def observation_factor(
     view: Any, blocks: tuple[Block, ...], y: Array, R: Array, huber: float, sensor: tuple[str, str]
 ) -> Factor:
     """Return what a mounted sensor measured, y (K, m) with noise R (K, p, p).  [S] (63).

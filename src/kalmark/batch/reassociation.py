@@ -111,7 +111,7 @@ class _Look:
         self.scan, self.ids = replay.given.associations.scan, batch.ids
         self.landmarks: dict[Id, Array] = dict(zip(batch.ids, batch.means, strict=True))
         self.seen = [
-            seen for key in replay.sighted if key[2] == LANDMARKS for seen in _seen(replay, batch, key, may_change)
+            seen for key in replay.observed if key[2] == LANDMARKS for seen in _seen(replay, batch, key, may_change)
         ]
         self.open = np.zeros(len(may_change), dtype=np.bool_)
         for seen in self.seen:
@@ -194,7 +194,7 @@ def _seen(replay: BatchReplay, batch: Batch, key: tuple[str, str, int], may_chan
     """Return the observations of one sensor that may change, if they determine places."""
     given, (robot, sensor, _) = replay.given, key
     mount = given.robots[robot].sensors[sensor]
-    rows = [one for one in replay.sighted[key] if may_change[one.row]]
+    rows = [one for one in replay.observed[key] if may_change[one.row]]
     if not rows or not isinstance(mount.sensor, FullSensor) or not len(batch.ids):
         return []
     at, poses = np.array(mount.at, dtype=np.float64), batch.state.groups[0]

@@ -10,7 +10,7 @@ The step dx and the multipliers m of `minimise |z - H dx|^2 + w' Q^+ w subject t
     [[A, J'], [J, -Q]] [dx; m] = [H'z; -e],      w = Q m,      A = H'H  (Newton: the Hessian),
 
 which needs no inverse of Q, so that Q may be singular.  The poses and multipliers form a chain in time, which a sparse
-LU eliminates; without motion the poses are independent.  What is left is the dense Schur complement S on the landmarks
+LU eliminates; without motion the poses are independent.  The remainder is the dense Schur complement S on the landmarks
 and mounts, whose inverse is their covariance.
 """
 
@@ -210,7 +210,7 @@ class Reduced:
             self.lu = splu(sp.csc_matrix(kkt[self.order][:, self.order]), permc_spec="COLAMD", diag_pivot_thresh=0.1)
         except RuntimeError:
             raise UndeterminedError(
-                "batch solution: the path is not determined by its motion and its sightings"
+                "batch solution: the path is not determined by its motion and its observations"
             ) from None
         self.at, self.S = at, A[self.rest][:, self.rest].toarray()
         self.through = np.empty(self.coupling.shape if math.prod(self.coupling.shape) <= KEPT else (0, 0))
@@ -259,7 +259,7 @@ class Reduced:
         except la.LinAlgError:
             L, lower = np.zeros((1, 1)), False
         if not (np.diagonal(L) ** 2 > FLAT * self.information).all():
-            what = f"a {self.kind} is not determined, the sightings do not determine all poses and {self.kind}s"
+            what = f"a {self.kind} is not determined, the observations do not determine all poses and {self.kind}s"
             raise UndeterminedError(f"batch solution: {what}: expected more of them")
         return L, lower
 

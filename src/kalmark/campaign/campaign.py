@@ -100,7 +100,7 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> Figures:
     `..._anees` is the average over steps, `..._inside` the share of steps inside the 95 % band, both after the first
     `skip` steps; joint ANEES is per dimension.  `pose_anees_sigma` is the standard error of the pose's, as the means of
     the runs scatter: the steps of one are correlated.  `..._median` of pose NEES over all runs and steps is not moved
-    by a run that diverges.  What the runs do not have (velocities, uncertain mounts) is left out.
+    by a run that diverges.  Figures that the runs do not have (of velocities, uncertain mounts) are left out.
     """
     result: Figures = {"runs": len(scores), "diverged": sum(s.diverged for s in scores)}
     stopped = sorted({s.stopped for s in scores if s.stopped})

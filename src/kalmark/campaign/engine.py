@@ -52,7 +52,7 @@ call_predict, call_correct = by_address(PREDICT), by_address(CORRECT)
 
 # of ranges and bearings: sigma_range_m, sigma_range_rel, sigma_bearing_rad, scale and bias_m
 Noise = tuple[float, float, float, float, float]
-Sightings = tuple[Index, Index, Index, Array, Array]  # as `by_landmark` returns
+Observations = tuple[Index, Index, Index, Array, Array]  # as `by_landmark` returns
 
 
 # ---------------------------------------------------------------------- what the engine runs
@@ -119,8 +119,8 @@ def _odd_filter(config: Config, name: str, landmarks: int) -> str:
     return ""
 
 
-# ---------------------------------------------------------------------- sightings
-def by_landmark(count: int, steps: Index, numbers: Index, places: Array, y: Array) -> Sightings:
+# ---------------------------------------------------------------------- observations
+def by_landmark(count: int, steps: Index, numbers: Index, places: Array, y: Array) -> Observations:
     """Return measurements y (N, 2) of points at `places` (N, 2) in `count` steps, in each those of new landmarks last.
 
     That is where each step begins (count + 1,), where its new ones do (count,), the places of landmarks in the state
@@ -188,7 +188,7 @@ def start_landmark(
 def filter_run(
     ways: tuple[int, int, int], routines: corrections.Routines, view: Any, motion: tuple[int, Array],
     tables: tuple[Table, Table, int], started: tuple[Array, Array], controls: tuple[Array, Array, Array, Array, bool],
-    sightings: Sightings, sensed: tuple[Array, Noise],
+    observations: Observations, sensed: tuple[Array, Noise],
     rules: tuple[float, int, float], scored: tuple[int, bool, Array],
 ) -> tuple[bool, Array, Array, Array, Array, float, int]:  # fmt: skip
     """Filter a run: predict, correct and start landmarks step by step, as `Slam.process` does with known ids.
@@ -204,7 +204,7 @@ def filter_run(
     """
     blocks, atoms, capacity = tables
     u, dt_s, N, density, held = controls
-    first, new, slots, y, places = sightings
+    first, new, slots, y, places = observations
     at, noise = sensed
     steps, axes, robot, mount, d, never = len(u), 1, 0, -1, 2, False
     no_effect = np.empty((u.shape[1], 0))
@@ -334,28 +334,28 @@ class Engine:
         if len(points) != self.landmarks or not parts:
             return None
         seen = Sighted(*map(np.concatenate, zip(*parts, strict=True)))
-        sightings = by_landmark(world.steps, seen.steps - 1, seen.ids, points[seen.ids - 1], seen.e)
+        observations = by_landmark(world.steps, seen.steps - 1, seen.ids, points[seen.ids - 1], seen.e)
         scores = {}
         for label, one in self.filters.items():
-            score = self._filter(one, robot.states, robot.told, sightings, map_every)
+            score = self._filter(one, robot.states, robot.given, observations, map_every)
             if score is None:
                 return None
             scores[label] = score
         return scores
 
-    def _filter(self, f: _Filter, states: Array, u: Array, sightings: Sightings, map_every: int) -> Scores | None:
+    def _filter(self, f: _Filter, states: Array, u: Array, observations: Observations, map_every: int) -> Scores | None:
         """Filter and score a run; None if the filter diverges."""
         N, density, held = f.control
         scored = map_every, f.coordinates == "log", states
         ok, mean, P, of_map, x, nis, fused = filter_run(
             f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
-            (u, self.seconds, N, density, held), sightings, f.sensed, f.rules, scored,
+            (u, self.seconds, N, density, held), observations, f.sensed, f.rules, scored,
         )  # fmt: skip
         if not ok:
             return None
         series = {key: np.full((1, len(u)), np.nan) for key in SERIES}
         for i, key in enumerate(MAP_NEES):
             series[key][0] = of_map[:, i]
-        places = sightings[-1]
+        places = observations[-1]
         found = x[3 : 3 + places.size].reshape(-1, 2), places, len(places), len(places)
         return scores_of(series, mean[None], P[None], states[None, 1:], f.coordinates, found, nis, 2 * fused, "")

@@ -1,9 +1,9 @@
-"""`Replay`: a parametric bootstrap of a log: the same route and sightings, all noise drawn again from the models.
+"""`Replay`: a parametric bootstrap of a log: the same route and observations, all noise drawn again from the models.
 
 The log goes through its filter twice: once as it is, for the map and the association; then on that map, known, so that
 the path fits the map at every time and does not jump where a loop closes.  That map is the truth now.  A robot follows
 the path *by its own motion*: it takes, for each control of the log, one near it that leads to where the robot was at
-the end of the interval; its filter is told that one with noise.  Each scan sees the landmarks that it saw in the log,
+the end of the interval; its filter is given that one with noise.  Each scan sees the landmarks that it saw in the log,
 from the true pose.
 
 The true control depends on where the robot truly is, its error does not: that is all that a filter assumes.
@@ -273,7 +273,7 @@ class _Driven:
     constants: Array  # of its controls
     sensors: dict[str, tuple[Any, Array]]
     drive: HeldInput
-    told: Array = field(default_factory=lambda: np.zeros(0))
+    given: Array = field(default_factory=lambda: np.zeros(0))
 
     def advance(self, t_ns: int, rng: Generator, last: bool = False) -> None:
         """Move by the control in force."""
@@ -284,7 +284,7 @@ class _Driven:
     def move(self, part: MotionPart, rng: Generator) -> None:
         """Move by a part of a control, with the diffusion of the control that the filter has."""
         self.state, *_ = self.motion.move(self.state, part.u, part.dt_s)
-        self.state = add_diffusion(self.motion, self.state, self.told, part.dt_s, rng)
+        self.state = add_diffusion(self.motion, self.state, self.given, part.dt_s, rng)
 
 
 class _Replaying:
@@ -332,8 +332,8 @@ class _Replaying:
         robot.advance(event.t_ns, rng, last=True)
         N = control_covariance(robot.motion, event)
         u = steer_to_path(robot.motion, robot.state, steer, N)
-        robot.told = given_control(robot.motion, u, robot.constants, steer.dt_s) + gaussian(N, rng)
-        self.events.append(replace(event, u=robot.told))
+        robot.given = given_control(robot.motion, u, robot.constants, steer.dt_s) + gaussian(N, rng)
+        self.events.append(replace(event, u=robot.given))
         for part in robot.drive.accept(replace(event, u=u, cov=None)):
             robot.move(part, rng)
 

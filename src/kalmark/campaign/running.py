@@ -362,7 +362,7 @@ def joblib_backend(backend: str, address: str | None = None) -> Iterator[None]:
 
 
 def require_module(module: str, packages: str) -> Any:
-    """Return an optional module.  Raises KalmarkError, saying what to install, if it is not there."""
+    """Return an optional module.  Raises KalmarkError with what to install if it is not there."""
     try:
         return import_module(module)
     except ImportError:

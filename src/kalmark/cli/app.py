@@ -40,7 +40,7 @@ def _refused(failure: PluginError) -> Callable[[], None]:
 
 app = typer.Typer(
     name="kalmark",
-    help="EKF-SLAM with a covariance that stays honest.",
+    help="EKF-SLAM with a consistent covariance.",
     epilog="CONFIG and WORLD are paths of YAML files or shipped names.  Start with: kalmark demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

@@ -63,7 +63,7 @@ def campaign(
 ) -> None:
     """Run a world many times, or a log with all noise drawn again: ANEES and its band, RMSE, divergences.
 
-    A log's route, map and sightings are those that its configured filter finds; all else is simulated by its models.
+    A log's route, map and observations are those that its configured filter finds; all else is simulated by its models.
     """
     announce_compilation_elsewhere()
     from kalmark.campaign import open_cells, run_sweep

@@ -43,8 +43,8 @@ BY_SIGMAS = "state a start without at_rest, as uncertain as it is: sigma_rotatio
 def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
     """Return the filter that a configuration describes, for the robots of a log and with its description of them.
 
-    Without a log the robots are those that the configuration names; `each` alone is one robot called "robot".  What is
-    `given`, arguments of `Slam`, stands in the place of what is configured.
+    Without a log the robots are those that the configuration names; `each` alone is one robot called "robot".  `given`
+    arguments of `Slam` take the place of configured ones.
 
     >>> from kalmark.config import build_slam
     >>> from kalmark.simulate import load_world, simulate
@@ -207,7 +207,7 @@ def _placed(
         if not np.allclose(said[key], told[key], rtol=1e-6, atol=1e-9):
             raise config.error(
                 (*path, key),
-                f"got {quote_value(said[key])}, expected {quote_value(told[key])} as its {' and '.join(exact)} says, "
+                f"got {quote_value(said[key])}, expected {quote_value(told[key])} by its {' and '.join(exact)}, "
                 "or none of these beside it",
             )
     return at, cov

@@ -23,7 +23,7 @@ NAMES = (
 def data_sheet(path: str | Path) -> dict[str, float]:
     """Return the noise of an `imu.yaml` of Kalibr's, or a `sensor.yaml` of EuRoC's, as parameters of `inertial`.
 
-    The keys may be below one named imu0, as in Kalibr's results.  What else is in the file is not read.  Raises
+    The keys may be below one named imu0, as in Kalibr's results.  Other keys of the file are not read.  Raises
     ConfigError: file, key, value and what was expected.
     """
     path = Path(path)
@@ -62,7 +62,7 @@ def calibration(path: str | Path, camera: str | None = None) -> dict[str, Any]:
 def take_data_sheets(tree: Tree, path: Path | None) -> None:
     """Put what is in each `data_sheet` and `calibration` that a tree, read from the file `path`, names in its place.
 
-    What is given beside it stays.  The file is looked for beside `path`, that of an override in the working directory.
+    Keys beside it stay.  The file is looked for beside `path`, that of an override in the working directory.
     Raises ConfigError.
     """
     robots = tree.values.get("robots")

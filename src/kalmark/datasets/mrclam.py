@@ -41,7 +41,7 @@ def read(
     path: Path,
     request: Request,
     bearing_shift_s: Annotated[Number, "Added to the time of every observation."] = 0.0,
-    robot_sightings: Annotated[bool, "Use the robots' sightings of each other."] = True,
+    robot_sightings: Annotated[bool, "Use the robots' observations of each other."] = True,
 ) -> Log:
     """Return the log of the wanted robots; measurements take the time of their stamp plus `bearing_shift_s`.
 
@@ -97,7 +97,7 @@ def read_measurements(
     """Return the scans of one robot: the measurements of one stamp are one scan."""
     scans: dict[int, dict[Id, list[float]]] = {}
     unknown: dict[int, list[int]] = {}  # lines by barcode
-    sightings = 0
+    observations = 0
     for line, t_ns, (barcode, *y) in timed_rows(path, ("barcode", "range_m", "bearing_rad"), request.refuse):
         subject = subjects.get(int(barcode))
         if y[0] < 0:
@@ -105,7 +105,7 @@ def read_measurements(
         elif subject is None:
             unknown.setdefault(int(barcode), []).append(line)
         elif subject in ignored:
-            sightings += 1
+            observations += 1
         elif subject in scans.setdefault(t_ns + shift_ns, {}):
             request.refuse(f"{path}:{line}: subject {subject} twice at one time, expected each once in a scan")
         else:
@@ -113,8 +113,8 @@ def read_measurements(
     for code, lines in sorted(unknown.items()):
         told = f"{path}:{lines[0]}: {len(lines)} of barcode {code}, which no subject carries"
         request.leave_out(len(lines), told)
-    if sightings:
-        request.leave_out(sightings, f"{path}: {sightings} sightings of robots (robot_sightings is false)")
+    if observations:
+        request.leave_out(observations, f"{path}: {observations} observations of robots (robot_sightings is false)")
     made = ((t_ns, list(seen), list(seen.values())) for t_ns, seen in scans.items() if seen)
     return [Scan(t_ns=t_ns, robot=robot, sensor=SENSOR, y=y, ids=ids) for t_ns, ids, y in made]
 

@@ -32,7 +32,7 @@ class Reflectors(Laser):
 
     def _find(self, r: Array, a: Array, intensities: Array | None) -> Detections:
         if intensities is None:
-            raise EventError("the beams have no intensities, expected those by which a reflector is told")
+            raise EventError("the beams have no intensities, expected those by which a reflector is recognised")
         bright = np.where(intensities >= self.intensity_min, r, np.inf)
         beams, step = self.pieces(bright, a)
         counts = beams[:, 1] - beams[:, 0] + 1

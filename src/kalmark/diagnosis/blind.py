@@ -15,8 +15,8 @@ from kalmark.results.truth import Truth
 def blind(run: Run) -> tuple[Run, Log]:
     """Return a run and its log as if the log had no truth, with the figures of such a run.
 
-    What the configuration took from the truth stays, as the filter was given it: where robots start whose
-    configuration states no start, and the landmarks of ``map.known: truth``.  Raises KalmarkError if the log of the run
+    Values that the configuration took from the truth stay, as the filter was given them: starts of robots whose
+    configuration states none, and the landmarks of ``map.known: truth``.  Raises KalmarkError if the log of the run
     cannot be read again.
     """
     slam, source = run.final_slam(), log_of_run(run)

@@ -12,7 +12,7 @@ from scipy.stats import norm
 from kalmark.arrays import Array
 from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import BatchInput
-from kalmark.batch.problem import sightings
+from kalmark.batch.problem import observation_factor
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
@@ -56,7 +56,7 @@ def calibrations(
         if key in sure or (_shows(s[k], sigma[k], level) and abs(s[k]) < column.most):
             chosen.append(k)
         elif _shows(*alone[k], level):
-            alike[key] = f"the log does not tell it from other systematic errors (alone {alone[k][0]:+.3g})"
+            alike[key] = f"the log does not distinguish it from other systematic errors (alone {alone[k][0]:+.3g})"
     beside = [k for k, c in enumerate(columns) if names[k] not in paths and c.unit and c.name != MOUNT]
     s, sigma, _ = _together(linear, [columns[k] for k in chosen + beside]) if chosen else (s, sigma, alone)
     found = [
@@ -79,7 +79,7 @@ def _mounts(linear: Linear, given: BatchInput) -> Iterator[Column]:
             at = np.array(mount.at, dtype=np.float64)
             at[axis] += MOVED_M
             view = view_of(mount.sensor, given.seen_by(mount.sensor), at)
-            moved, _ = sightings(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor).term.at(
+            moved, _ = observation_factor(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor).term.at(
                 linear.state
             )
             parts = [np.zeros(other.R.shape[:2]) for other in linear.problem.factors]

@@ -86,10 +86,10 @@ class Search:
     def run(self, progress: bool = False) -> list[Finding]:
         """Return all causes, the one that explains most first.
 
-        Noise that is stated too large does no harm, and hides none of the others: it is taken out when all of them
-        are.  Where errors last it ends the search.  What is new in each sighting is then smaller than the error: a
-        weight by that would make systematic errors of what lasts, and a map that is too sure.  So the problem is left
-        with noise that is not below the one stated.
+        Overstated noise is removed last, because it is harmless and does not mask other causes.  Where errors are
+        correlated it ends the search: their innovations are smaller than the errors, and a weight by the innovations
+        would take correlated errors for systematic ones and make the map overconfident.  So the problem keeps at least
+        the stated noise.
         """
         rounds, lasting = ROUNDS + MORE, False
         for n in track(range(rounds), "causes, one after the other", rounds, show=progress):
@@ -133,7 +133,7 @@ class Search:
         return max(same, key=alone)
 
     def correlated(self) -> list[Finding]:
-        """Return the errors that last from sighting to sighting."""
+        """Return the errors that are correlated from one observation to the next."""
         found = causes.correlations(self.linear, self.simulated, self.sensors, self.t_s)
         return [f for f in found if f.p * len(found) < ALPHA and f.gain > LEAST_GAIN]
 

@@ -55,7 +55,7 @@ def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
     evidence, cure = text(finding, config)
     if finding.alike:
         others = ", ".join(f"{other.name} {_value(other)}" for other in finding.alike)
-        evidence += f"; the log cannot tell this from {others}"
+        evidence += f"; the log does not distinguish this from {others}"
         cures = (cure, *(finding_text(other, config)[1] for other in finding.alike))
         cure = OR.join(dict.fromkeys(line for line in cures if line))
     return evidence, cure
@@ -159,7 +159,7 @@ def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
 def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
     sure = f" ({_sure(finding)})" if finding.sigma > 0.0 else ""
-    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps say{sure}"
+    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps{sure}"
     where = finding.of[:1] if finding.of[1] == ALL else finding.of[:2]
     return evidence, log_correction_line(config, "shift_s", where, finding.value)
 
@@ -173,11 +173,10 @@ def _mount_position(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, column, kind = finding.of
-    little = "little" if finding.value > 0 else "much"
-    verb = "steers" if column == "steering_rad" else "turns" if column.endswith(("_rad", "_radps")) else "drives"
+    small = "small" if finding.value > 0 else "large"
     each = " for each metre driven" if kind == "per_way" else ""
     size = _size(abs(finding.value), finding.unit.removesuffix("/m") if each else finding.unit)
-    evidence = f"{column} of {robot} says that it {verb} {size}{each} too {little} ({_sure(finding)})"
+    evidence = f"{column} of {robot} is {size} too {small}{each} ({_sure(finding)})"
     key = CALIBRATIONS.get((column, kind))
     cure = _set(robot, f"motion.{key}", abs(finding.value)) if key else f"correct {column} by {_value(finding)}{each}"
     return evidence, cure
@@ -187,7 +186,7 @@ def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, *of = finding.of
     if finding.name == "start":
         if finding.at is not None:
-            return f"{robot} does not start where it is said to: it is {_jump(finding)} from there", ""
+            return f"{robot} starts {_jump(finding)} from its stated start", ""
         return f"the start is {figure(finding.value, 2)} times as uncertain as stated", ""
     if finding.name == "control_sigma":
         what, path = f"the noise of {robot}'s {of[0] or 'motion'}", ["motion", _sigma_of(of[0])]
@@ -213,8 +212,9 @@ def _offset(finding: Finding, config: Mapping[str, Any]) -> Words:
 def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
     factor = math.sqrt(max((1.0 + finding.value) / (1.0 - finding.value), 1.0))
     evidence = (
-        f"errors of {_sensor(finding)} {finding.of[2]} last from sighting to sighting (correlation"
-        f" {figure(finding.value, 2)}): they say as little as white noise of {figure(factor, 2)} times the sigma"
+        f"errors of {_sensor(finding)} {finding.of[2]} are correlated between observations (correlation"
+        f" {figure(finding.value, 2)}): they carry the information of white noise of {figure(factor, 2)} times the"
+        " sigma"
     )
     return evidence, ""
 
@@ -229,8 +229,8 @@ def _landmark_prior(finding: Finding, config: Mapping[str, Any]) -> Words:
     name = finding.of[0]
     at = ", ".join(figure(float(x)) for x in (np.zeros(0) if finding.at is None else finding.at))
     evidence = (
-        f"landmark {name} is {figure(finding.value)} m from where its survey says ({_sure(finding)}):"
-        f" its sightings place it at ({at}) m"
+        f"landmark {name} is {figure(finding.value)} m from its survey ({_sure(finding)}):"
+        f" its observations place it at ({at}) m"
     )
     return evidence, f"correct {name} in the file of the survey, or leave it out"
 
@@ -258,7 +258,7 @@ def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 
 def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
-    by = f"{finding.of[0]} moves by {_jump(finding)} more than its controls say at t={finding.of[1]} s"
+    by = f"{finding.of[0]} moves by {_jump(finding)} more than by its controls at t={finding.of[1]} s"
     return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding)}", ""
 
 

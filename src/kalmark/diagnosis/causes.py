@@ -36,7 +36,7 @@ FAR_STEPS, FAR_S = 3.0, 5.0  # no driving: farther than so many long steps, and 
 SELDOM = 1e-3
 MOST_RHO = 0.999
 ALIKE = 0.85  # of what another one explains: they are alike
-SUCCESSIVE = 3.0  # times the usual time between two sightings of a landmark
+SUCCESSIVE = 3.0  # times the usual time between two observations of a landmark
 TIMES = "times"  # the unit of noise
 JUMPS = ("odometry_jump", "kidnapped")
 
@@ -224,7 +224,7 @@ def _noise(
 def correlations(
     linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ...]], t_s: Array
 ) -> list[Finding]:
-    """Return by how much what is left of successive sightings of one landmark is correlated, by sensor and column.
+    """Return by how much what is left of successive observations of one landmark is correlated, by sensor and column.
 
     `t_s` (n,) are the times of the poses.  The noise of a finding is the white noise of the same information.
     """
@@ -277,7 +277,7 @@ def outliers(linear: Linear, t_s: Array) -> list[Finding]:
 
 
 def moving_landmarks(linear: Linear, t_s: Array) -> list[Finding]:
-    """Return the landmarks that move: whose sightings fit a constant velocity better than a place.
+    """Return the landmarks that move: whose observations fit a constant velocity better than a place.
 
     `t_s` (n,) are the times of the poses.  Only those are looked at that seem to move most with all else as it is.
     """
@@ -385,7 +385,7 @@ def _free_steps(linear: Linear, nodes: list[int]) -> Iterator[tuple[float, Array
 def priors(linear: Linear, t_s: Array) -> list[Finding]:
     """Return the surveyed landmarks that are elsewhere than their survey, each as if it were the only one.
 
-    Their sightings determine where they are.  Only those are looked at whose surveys seem to be off most.
+    Their observations determine where they are.  Only those are looked at whose surveys seem to be off most.
     """
     rows, d, found = linear.rows, linear.state.d, []
     for _, l, place, sign, mine, part in sorted(_surveyed(linear), key=lambda seems: -seems[0])[:LOOKED_AT]:
@@ -415,7 +415,7 @@ def _surveyed(linear: Linear) -> Iterator[tuple[float, int, Array, int, Ints, Ar
     """Yield of each surveyed landmark how much it seems to be off, its number and place, a sign, rows and derivative.
 
     A survey with a covariance is data: it is off by what was added to it, sign -1.  One that is exact is not: its
-    sightings are of a landmark that is elsewhere, sign +1.
+    observations are of a landmark that is elsewhere, sign +1.
     """
     d, problem, rows = linear.state.d, linear.problem, linear.rows
     if linear.state.spaces[LANDMARKS].dof < d:

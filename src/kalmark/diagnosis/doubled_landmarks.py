@@ -1,6 +1,6 @@
-"""Sightings of a map in their order: things that are in it twice, or that are not seen again; a robot that was moved.
+"""Faults that the order of observations shows: duplicated landmarks, landmarks not observed again, a moved robot.
 
-A residual shows none of them: each landmark fits its own sightings.
+A residual shows none of them: each landmark fits its own observations.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NEIGHBOURS = 3  # of a landmark that may be the same thing
 NEAR_SCANS = 5  # within which both of two landmarks in view would be seen
 SELDOM = 1e-4  # the probability, over all pairs, that two things are never seen together by chance
 LEAST_SEEN = 4  # landmarks that are seen until a robot is moved
-EDGES = 0.05, 0.95  # of the bearings and ranges of all sightings: what is beyond them may be out of view
+EDGES = 0.05, 0.95  # of the bearings and ranges of all observations: what is beyond them may be out of view
 TINY = 1e-300
 LATER, FEW_BACK, MOSTLY = 20, 0.25, 0.5  # scans after it, in which few of them are seen, and most landmarks are new
 
@@ -52,10 +52,10 @@ class Pair(NamedTuple):
 def find_split_landmarks(run: Run) -> list[Pair]:
     """Return pairs of near landmarks that are one thing.
 
-    They are sighted in turn, within a few scans, but never together.  Of two things, each is seen in a share p of the
+    They are observed in turn, within a few scans, but never together.  Of two things, each is seen in a share p of the
     scans between others in which it is, so both are in p^2 of them.
     """
-    seen, where = _sightings(run), _places(run)
+    seen, where = _observed_in(run), _places(run)
     names = [name for name in seen if name in where]
     if len(names) < 2:
         return []
@@ -143,7 +143,7 @@ def _places(run: Run) -> dict[str, Array]:
     return {name: place for name, place in where.items() if np.isfinite(place).all()}
 
 
-def _sightings(run: Run) -> dict[str, Ints]:
+def _observed_in(run: Run) -> dict[str, Ints]:
     """Return the scans (k,) of two landmarks or more in which each landmark without an id was observed."""
     h = run.history
     used = (h.outcome == "associated") & (h.id == "")
@@ -163,7 +163,7 @@ def _regularity(all_scans: Iterable[Ints]) -> float:
 
 
 def _in_turn(a: Ints, b: Ints) -> int:
-    """Return how many sightings of two landmarks alternate, 0 if they were ever seen together."""
+    """Return how many observations of two landmarks alternate, 0 if they were ever seen together."""
     scans, of = np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)])
     order = np.argsort(scans, kind="stable")
     gaps, changes = np.diff(scans[order]), np.diff(of[order]) != 0

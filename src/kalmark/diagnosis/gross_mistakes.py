@@ -191,7 +191,7 @@ def _is_lost(run: Run, robot: str) -> bool:
 
 
 def _alone(events: list[Event], robot: str, robots: Sequence[str]) -> Iterator[Event]:
-    """Yield the events of a robot without its fixes and its sightings of others."""
+    """Yield the events of a robot without its fixes and its observations of others."""
     for e in events:
         if e.robot != robot or isinstance(e, Fix):
             continue

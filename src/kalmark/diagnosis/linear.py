@@ -30,7 +30,7 @@ OUT = 1e3  # times its noise: what is so uncertain does not count
 class Rows(NamedTuple):
     """Origin of each whitened residual (N,): factor and row there, column, landmark (-1: none) and node.
 
-    `one` and `two` (P,) are the rows of successive sightings of one landmark, by one sensor and column.
+    `one` and `two` (P,) are the rows of successive observations of one landmark, by one sensor and column.
     """
 
     factor: Ints

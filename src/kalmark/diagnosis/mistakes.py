@@ -163,7 +163,7 @@ def _turned(config: Mapping[str, Any], robot: str, sensors: list[str], turn: int
         angle = math.remainder(old + turn, 360.0) if space else math.remainder(old + turn * DEGREE, 2 * math.pi)
         config = with_value(config, path, angle)
         cures.append(f"--set robots.{robot}.sensors.{sensor}.mount.{name}={angle:.4f}")
-    said = f"{of} {turn} deg away from where {'its mount says' if len(sensors) == 1 else 'their mounts say'}"
+    said = f"{of} {turn} deg away from the direction of {'its mount' if len(sensors) == 1 else 'their mounts'}"
     return Mistake("mount", said, " ".join(cures), config)
 
 

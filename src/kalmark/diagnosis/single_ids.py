@@ -1,7 +1,7 @@
 """Ids that do not mean one place: on two things, exchanged, of a thing that was moved or that moves.
 
-A filter with a gate leaves out what does not fit its path.  What it leaves out of one id is given another name, and the
-log is filtered again: it is likelier if that is a place of its own.
+A filter with a gate leaves out observations that do not fit its path.  Those of one id are given another name, and the
+log is filtered again: it is likelier if they are of a place of its own.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 from kalmark.tracks.channel import Channel, ObservationModel
 
 GATE = 0.9999  # with which a log that does not fit is filtered again
-LEAST = 8  # sightings of an id that do not fit: it may mean another place
-OFF = 6.0  # d2 per degree of freedom of a sighting that does not fit
+LEAST = 8  # observations of an id that do not fit: it may mean another place
+OFF = 6.0  # d2 per degree of freedom of an observation that does not fit
 MOST = 0.5  # of the ids that were seen meanwhile: more of them are not moved, the robot is
-SHARE = 0.1  # of the sightings of an id that are of another place, or of a place after it was left
+SHARE = 0.1  # of the observations of an id that are of another place, or of a place after it was left
 SAME = 0.25  # of the distance to the next landmark, within which two places are one
 OUTLIERS, TWICE, MOVED, MISPLACED = "outliers", "wrong_ids", "moving_landmark", "misplaced_landmark"  # the causes
 MOVES, TWO, GONE = "moves", "on two things", "moved"
@@ -63,7 +63,7 @@ class Filtered(NamedTuple):
 
 
 def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | None:
-    """Return that ids do not mean one place each, or single sightings are off, and the log filtered without that.
+    """Return the fault of ids that name more than one place, or of single wrong observations, and the run without them.
 
     Of a log of more than `AT_ONCE` observations that is the part about the first that do not fit.
     """
@@ -111,7 +111,7 @@ def _part(run: Run, log: Log, now: Fit, far: int) -> tuple[Mapping[str, Any], Lo
 
 
 def _first_off(h: History, now: Fit) -> int | None:
-    """Return the first sighting that does not fit, None unless many of one id do not, or many are far off."""
+    """Return the first observation that does not fit, None unless many of one id do not, or many are far off."""
     named = h.id != ""
     off = np.flatnonzero(named & (now.values > OFF))
     number = np.unique(h.id[off], return_counts=True)[1]
@@ -121,7 +121,7 @@ def _first_off(h: History, now: Fit) -> int | None:
 
 
 def _of_others(first: Run, rows: Ints) -> float:
-    """Return by how much likelier it is that sightings fit other landmarks more often than those do that fit their own.
+    """Return the log-likelihood ratio of rejected against fitting observations to fit another landmark than their own.
 
     That is the logarithm of a likelihood ratio.  How often chance does it depends on how landmarks are crowded.
     """
@@ -133,7 +133,7 @@ def _of_others(first: Run, rows: Ints) -> float:
 
 
 def _fit_others(first: Run, rows: Ints) -> Flags:
-    """Return which sightings (N,) fit another landmark than their own.
+    """Return which observations (N,) fit another landmark than their own.
 
     Robots are where the run had them then, landmarks where it has them in the end.
     """
@@ -199,7 +199,7 @@ def _since_s(run: Run, rows: Ints) -> float:
 
 
 def _elsewhere(h: History) -> Flags:
-    """Return which sightings (O,) do not fit where their ids are at the end; these may have been begun again there.
+    """Return which observations (O,) do not fit where their ids are at the end; these may have been begun again there.
 
     Those of a robot that is elsewhere do not count.
     """
@@ -210,7 +210,7 @@ def _elsewhere(h: History) -> Flags:
 
 
 def _renamed(log: Log, run: Run, rows: Ints, name: Callable[[str], str]) -> list[Event]:
-    """Return the events of a log in which the sightings of some rows of a run have other names."""
+    """Return the events of a log in which the observations of some rows of a run have other names."""
     h = run.history
     keys = {(h.t_ns[h.step[k]], h.robot[h.step[k]], h.sensor[k], h.index[k]) for k in rows.tolist()}
 
@@ -231,7 +231,7 @@ def _other(name: str) -> str:
 def _in_order(h: History, name: str) -> list[tuple[str, Ints]]:
     """Return an id and its other name, and the rows of both, those that were seen first before the others.
 
-    It is one of both where no sighting has the other one.
+    It is one of both where no observation has the other one.
     """
     rows = [(of, np.flatnonzero(h.id == of)) for of in (name, _other(name))]
     return sorted(((of, mine) for of, mine in rows if len(mine)), key=lambda one: int(one[1][0]))
@@ -256,7 +256,7 @@ def _told(h: History, places: Mapping[str, Array], name: str) -> str:
 
 
 def _together(told: Mapping[str, str]) -> str:
-    """Return what is said of ids, of those of one meaning at once."""
+    """Return a sentence about ids, those of one meaning together."""
     names = {meaning: [name for name, of in told.items() if of == meaning] for meaning in told.values()}
     return "; ".join(
         TEXTS[of][len(mine) > 1].format(", ".join(mine)) if of in TEXTS else of for of, mine in names.items()

@@ -75,7 +75,7 @@ class Filtered(NamedTuple):
         return sorted(both)
 
     def tried(self) -> list[Where]:
-        """Return those of them that have a configuration, but not what notices a rest."""
+        """Return the configured sensors, without detectors of rest."""
         robots = self.run.final_slam().robots
         built_in = (of for of in self.sensors() if isinstance(robots[of[0]].sensors[of[1]].sensor, StateSensor))
         return [of for of in built_in if self.run.section(*of).get("type") != NOTICES]

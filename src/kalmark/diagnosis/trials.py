@@ -1,7 +1,7 @@
 """Trials: a log filtered again as if something were not wrong with it, and how much likelier the same observations are.
 
-What a change leaves unused counts as an observation at the cap, as it does without the change: no change is better for
-what it leaves out.
+An observation that a change leaves unused counts as one at the cap, as it does without the change: no change gains by
+observations that it leaves out.
 """
 
 from __future__ import annotations
@@ -69,11 +69,11 @@ REFUSED = Fit(np.zeros(0), np.zeros(0), np.zeros(0))
 def fit_of_run(run: Run, shrunk: Mapping[tuple[str, str], float] | None = None) -> Fit:
     """Return the fit of the observations of a run: one without a landmark counts `MOST`.
 
-    What has no id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new ones all the
-    time, and clutter fits none either.  What is deferred after a gap, until the robot is known again, contradicts
-    nothing, nor does what is of a landmark that no sensor has started, what was given before, or what an attention
-    leaves out.  `shrunk` has by how much the logarithm of what a sensor measures is smaller than in the log:
-    so much smaller is its density there.
+    An observation without an id counts `LOST` where it is of no landmark in the map: a filter that is lost makes new
+    ones all the time, and clutter fits none either.  One that is deferred after a gap, until the robot's pose is known
+    again, contradicts nothing, nor does one of a landmark that no sensor has started, one that was given before, or one
+    that an attention leaves out.  `shrunk` has by how much the logarithm of what a sensor measures is smaller than in
+    the log: so much smaller is its density there.
     """
     history = run.history
     known = np.isfinite(history.z)
@@ -138,13 +138,15 @@ def fit_with(log: Log, events: Iterable[Event], change: Mistake) -> Fit:
 
 
 def first_of(made: Sequence[Mistake]) -> Mistake | None:
-    """Return the change that explains most, the first of several; the others are said with it."""
+    """Return the change with the largest gain.  Its evidence names those of nearly equal gain."""
     if not made:
         return None
     most = max(one.gain for one in made)
     first, *others = (one for one in made if one.gain >= ALIKE * most)
     alike = "; or: ".join(one.evidence for one in others)
-    return first._replace(evidence=f"{first.evidence}; the log cannot tell this from: {alike}") if alike else first
+    if not alike:
+        return first
+    return first._replace(evidence=f"{first.evidence}; the log does not distinguish this from: {alike}")
 
 
 def likelihood_gain(before: Fit, after: Fit, but: Ints | None = None) -> float:

@@ -2,8 +2,8 @@
 
 Rounds of filter, batch solution and estimates, until nothing changes by 3 %: calibrations by the score of what is left
 of the data (`kalmark.diagnosis.linear`), each beside all that a log may have instead, then the variance components
-(`kalmark.diagnosis.components`).  What the first part does not determine, and what does not make the innovations of
-the rest likelier, is left as it was.
+(`kalmark.diagnosis.components`).  A parameter that the first part does not determine, or that does not make the
+innovations of the rest likelier, stays as it was.
 """
 
 from __future__ import annotations

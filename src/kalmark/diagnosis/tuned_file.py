@@ -120,12 +120,12 @@ def correlation_lines(tuning: Tuning) -> list[str]:
     if not tuning.correlations:
         return []
     told = ", ".join(f"{name} {figure(rho, 2)}" for name, rho in tuning.correlations.items())
-    first = f"Errors last from one observation to the next (correlation of {told})."
+    first = f"Errors are correlated from one observation to the next ({told})."
     if tuning.aim == AIMS[1]:
-        return [first, "The noise is as large as says as little; innovations are smaller than it."]
+        return [first, "The noise is increased until it carries as little information; the innovations are smaller."]
     factor = figure(tuning.sigma_factor, 2)
-    return [first, f"This noise fits the innovations; the sigmas of the map are {factor} times as large as it claims.",
-            "kalmark tune --aim map gives a noise by which they are not."]  # fmt: skip
+    return [first, f"This noise fits the innovations; the sigmas of the map are {factor} times as large as it states.",
+            "kalmark tune --aim map finds a noise without this."]  # fmt: skip
 
 
 def _text(value: Any) -> str:

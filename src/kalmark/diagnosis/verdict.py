@@ -451,7 +451,7 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
 
 
 def is_misplaced_survey(run: Run, finding: Finding) -> bool:
-    """Return whether a finding is a surveyed landmark that the map has elsewhere than its sightings."""
+    """Return whether a finding is a surveyed landmark that the map has elsewhere than its observations."""
     names = [str(id_) for id_ in run.landmarks.ids]
     if finding.name != "landmark_prior" or finding.at is None or finding.of[0] not in names:
         return False
@@ -512,8 +512,8 @@ def _lost(run: Run) -> Iterator[Cause]:
     """Yield the robots that nothing places any more at the end of the run."""
     for one in find_lost_robots(run):
         evidence = f"the last {one.number} {one.of} of {one.robot}, from t={one.since_s:.1f} s on, were left out: "
-        evidence += "it is not where the path says, or they are wrong"
-        cure = "look at what its controls and these say from then on, or state more noise"
+        evidence += "the path or these measurements are wrong"
+        cure = "compare its controls with these from then on, or state more noise"
         yield Cause("lost", one.since_s, 0.5 * MOST * one.number, evidence, cure)
     state, end_s = run.final_slam().state, float(run.history.t_ns.max(initial=0)) * 1e-9
     for robot, of in state.evidence.items():
@@ -521,7 +521,7 @@ def _lost(run: Run) -> Iterator[Cause]:
         lasts = end_s - since_s >= LEAST_S and not state.moving[robot].held.is_adrift
         if of.ratio <= -math.log(ODDS) and lasts:
             evidence = f"{robot} does not see {number} where it should from t={since_s:.1f} s on: it is elsewhere"
-            cure = "look at what moved it then, which its controls do not say"
+            cure = "look for a motion at that time that the controls do not contain"
             yield Cause("lost", since_s, -of.ratio, evidence, cure)
 
 
@@ -543,12 +543,12 @@ def _remapped_landmarks(run: Run) -> Iterator[Cause]:
     for change in (c for c in h.changes if c.reason == BEGUN_AGAIN):
         rows = np.flatnonzero((h.id == change.landmark) & (h.step <= change.step))
         now_s, begun_s = (float(h.t_ns[step]) * 1e-9 for step in (change.step, h.step[rows].min(initial=change.step)))
-        score, cure = 0.5 * MOST * len(rows), f"leave out its first sighting, at t={begun_s:.1f} s"
-        if (h.outcome[rows] != "rejected").sum() > 1:  # there, too, sightings agreed
+        score, cure = 0.5 * MOST * len(rows), f"leave out its first observation, at t={begun_s:.1f} s"
+        if (h.outcome[rows] != "rejected").sum() > 1:  # there, too, observations agreed
             told = f"landmark {change.landmark} was moved by t={now_s:.1f} s: from then on it is mapped there"
             yield Cause(MOVED, now_s, score, told, "", True)
             continue
-        told = f"landmark {change.landmark} was begun by an outlier: from later sightings it was begun again"
+        told = f"landmark {change.landmark} was begun by an outlier: from later observations it was begun again"
         yield Cause(MISPLACED, begun_s, score, told, cure, True)
 
 
@@ -611,7 +611,7 @@ def abandoned_surveys(run: Run) -> list[Cause]:
         off, at = mean - prior.mean[:d], ", ".join(figure(float(x)) for x in mean)
         chi2 = float(off @ np.linalg.pinv(P) @ off)
         evidence = (
-            f"landmark {change.landmark} is {figure(float(np.linalg.norm(off)))} m from where its survey says"
+            f"landmark {change.landmark} is {figure(float(np.linalg.norm(off)))} m from its survey"
             f" ({figure(float(np.sqrt(chi2)), 2)} sigma): the filter left its survey out and mapped it at ({at}) m"
         )
         cure = f"correct {change.landmark} in the file of the survey, or leave it out"
@@ -746,7 +746,7 @@ def unseen_landmarks(run: Run) -> Iterator[Cause]:
 
 
 def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:
-    """Yield that the filter claims smaller sigmas than the same data allow, if it does."""
+    """Yield the cause `overconfident` if the filter's sigmas are below those of the batch solution."""
     if effect.claimed is None:
         return
     score = 0.5 * effect.dof * float(effect.claimed**-2 - 1.0 + 2.0 * np.log(effect.claimed))

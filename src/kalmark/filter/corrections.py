@@ -7,7 +7,7 @@ its sensor's mount (-1: not in the map), the slots of K landmarks of which the f
 (K, m) with the noise R (K, p, p) of their innovations, and the gate on d2.  The head of the observed block is the
 robot's pose and, if it is in the map, the mount.  Nothing is changed unless all of it succeeds.
 
-What is called by address is compiled once, alone; what a map has no use for is not compiled at all.  Compiled code
+A function that is called by address is compiled once, alone, and only if a map uses it.  Compiled code
 here indexes its arrays: slices, products and fancy indices are what takes numba long.
 """
 

@@ -1,7 +1,8 @@
-"""The blocks that a correction of the invariant filter turns, and their rotation.  docs/invariant.md.
+"""Covariance transport of the invariant filter: the blocks that depend on the gauge, and their rotation.
 
-The map turns with the sensor that observes it: the gauge.  The error d of a vector of the world may be correlated with
-the error of a lever arm a, or with the rotation errors of other inertial units r relative to the observing robot:
+The map turns with the sensor that observes it: the gauge (docs/invariant.md).  The error d of a vector of the world may
+be correlated with the error of a lever arm a, or with the rotation errors of other inertial units r relative to the
+observing robot:
 
     d = L_a d_a + L_r (d_theta_r - d_theta) + e,    L = Cov(d, .) Cov(., .)^-1
 

@@ -37,8 +37,8 @@ def error_transport(space: Space, before: Array, after: Array, observes: bool) -
     """Return T (dof, dof): the errors d (dof,) of an inertial unit, corrected from `before` to `after`, become T d.
 
     Attitude, velocity and gravity turn as the attitude did, about the vertical alone where that is known, so that the
-    heading stays as unobservable as it was.  What turns is xi = d - generator d_theta: to E xi + generator E d_theta.
-    Where the vertical is known, d_theta of the unit that `observes` has turned in the correction.
+    heading stays as unobservable as it was.  The turn is one of xi = d - generator d_theta: to E xi + generator E
+    d_theta.  Where the vertical is known, d_theta of the unit that `observes` has turned in the correction.
     """
     E, T, M = matrix(after[3:7]) @ matrix(before[3:7]).T, np.eye(space.dof), np.eye(3)
     if space.kinds == UNIT:

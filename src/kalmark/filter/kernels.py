@@ -55,7 +55,7 @@ BAND, NARROW = 128, 32  # rows of a larger one that do, and rows of a smaller on
 TILE = 64  # rows of a tile of which two do
 FEW = 8  # rows of a factor whose product takes less time without BLAS
 
-# What rounding may take off a variance: with these a covariance stays one where 1e-5 rad are beside metres
+# Bounds on what rounding takes off a variance: with these a covariance stays one where 1e-5 rad are beside metres
 KEPT = 2.0**-50  # of what a variance loses to a correction, and of the terms that a prediction adds up
 RAISED = 2.0**-44  # of the variance of an innovation
 LEAST_VARIANCE = 1e-20  # m^2, rad^2: what is smaller has no sign
@@ -383,7 +383,7 @@ def cholesky_inverse(S: Array) -> tuple[Array, bool]:
 def are_covariances(S: Array, margin: float) -> bool:
     """Return whether S (K, n, n), in units of their sigmas, are symmetric up to |margin| and S + margin 1 definite.
 
-    By Cholesky's pivots.  Nothing is said of a matrix that is near the limit: of it only the eigenvalues are sure.
+    By Cholesky's pivots.  Near the limit the answer may be wrong: only the eigenvalues are certain there.
     """
     n = S.shape[1]
     sigma, L = np.empty(n), np.empty((n, n))

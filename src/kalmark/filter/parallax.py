@@ -1,8 +1,8 @@
 """Correct inverse distances through the parallax they stand for.  docs/bearing_only.md.
 
 An anchored landmark is seen along m - rho t, t = s - a the way from its anchor a to the sensor s: pictures measure the
-parallax q = rho n, n = sqrt(|t|^2 + c2), not rho.  What they leave open, the scale of map and motion, moves s and a
-along straight lines but rho along a hyperbola, so that a plain correction of rho takes the gap for information on the
+parallax q = rho n, n = sqrt(|t|^2 + c2), not rho.  They do not determine the scale of map and motion, which moves s and
+a along straight lines but rho along a hyperbola, so that a plain correction of rho takes the gap for information on the
 scale.  Here it is the error of the parallax, d_q = n d_rho + g.(d_s - d_a) with g = rho t / n, that a correction adds
 to q and that keeps its meaning from x- to x+, just as xi does.  c2 = trace Cov(t) at the prediction: where the baseline
 is less than its own uncertainty, rho is corrected as it is.  In space an anchor is an atom ANCHOR, in the plane the

@@ -179,7 +179,7 @@ class TextbookSlam:
         return e, H
 
     def correct(self, i: int, y: Any, gate: float = 9.0) -> bool:
-        """Correct with the sighting y = (range, bearing) of landmark i; return whether it passed the gate."""
+        """Correct with the observation y = (range, bearing) of landmark i; return whether it passed the gate."""
         e, H = self.expect(i)
         z = np.asarray(y) - e  # (19)
         z[1] = wrap(z[1])
@@ -195,7 +195,7 @@ class TextbookSlam:
         return True
 
     def initialize(self, y: Any) -> int:
-        """Add the landmark sighted at y = (range, bearing); return its number."""
+        """Add the landmark observed at y = (range, bearing); return its number."""
         m, n = self.m, len(self.x)
         l, L_r, L_y = self.inv_observe(self.x[:m], np.asarray(y, dtype=np.float64))  # (32)-(34)
         G = np.zeros((2, n))

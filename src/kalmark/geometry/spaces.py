@@ -28,7 +28,7 @@ coordinates and their 3-D counterpart.
 
 HOMOGENEOUS and PLUECKER are moved by a translation t of the world by what depends on their value, h + rho t and
 n + t x v, so that translation has a generator, too: rho I and -[v]x.  All others are moved by what does not, and need
-none.  What the invariant estimator does about inverse distances is in `filter/parallax.py`.
+none.  For inverse distances see `filter/parallax.py`.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ OWN_COPIES = (
     OwnCopy("plaza1", "a robot lawn mower ranging to four radio beacons, true path and beacons",
             "Plaza1_DR.txt, Plaza1_TD.txt and Plaza1_.mat of the package gtsam (gtsam/Data) into KALMARK_DATA/plaza1"),
     OwnCopy("starry_night", "a stereo camera above 20 reflectors, rates, known ids, true poses and map",
-            "vincentive_dataset3.mat into KALMARK_DATA/starry_night (docs/datasets3d.md says where it is from)"),
+            "vincentive_dataset3.mat into KALMARK_DATA/starry_night (its source: docs/datasets3d.md)"),
     OwnCopy("slamtb", "recordings of the Matlab SLAM toolbox: cameras seeing points or segments, its own figures",
             "NAME.json.gz and NAME.npz into KALMARK_ORACLE (docs/datasets3d.md)"),
     OwnCopy("tum_rgbd", "a colour and depth camera held by hand, true poses (CC BY 4.0)",

@@ -213,7 +213,7 @@ def robot_names(robots: Any, prefix: str = "") -> Names | None:
 
 
 def keep_robots(log: Log, request: Request) -> Log:
-    """Return the log of the robots asked for; sightings of the others are left out and listed."""
+    """Return the log of the robots asked for; observations of the others are left out and listed."""
     if request.robots is None:
         return log
     for robot in request.robots:
@@ -222,10 +222,10 @@ def keep_robots(log: Log, request: Request) -> Log:
     entry = known_formats().get(log.format)
     others = {*log.robots, *(entry.robots if entry else ())} - {*request.robots}
     left_out: Counter[str] = Counter()
-    kept = (remove_sightings(event, others, left_out) for event in log if event.robot in request.robots)
+    kept = (remove_observations(event, others, left_out) for event in log if event.robot in request.robots)
     events = [event for event in kept if event is not None]
     for robot, count in sorted(left_out.items()):
-        request.leave_out(count, f"{log.path or log.name}: {count} sightings of {robot}, which was not asked for")
+        request.leave_out(count, f"{log.path or log.name}: {count} observations of {robot}, which was not asked for")
     names, rig = request.robots, log.describes
     if "robots" in rig:
         rig = rig | {"robots": select_robots(rig["robots"], (*names, "each"))}
@@ -242,8 +242,8 @@ def select_robots(table: dict[str, Any], robots: Sequence[str]) -> dict[str, Any
     return {name: value for name, value in table.items() if name in robots}
 
 
-def remove_sightings(event: Event, others: set[str], left_out: Counter[str]) -> Event | None:
-    """Return the event without the sightings of these robots, or None if nothing else was seen."""
+def remove_observations(event: Event, others: set[str], left_out: Counter[str]) -> Event | None:
+    """Return the event without the observations of these robots, or None if nothing else was seen."""
     if not isinstance(event, Scan) or event.ids is None or others.isdisjoint(event.ids):
         return event
     left_out.update(id_ for id_ in event.ids if isinstance(id_, str) and id_ in others)

@@ -1,7 +1,7 @@
 """Tables with a header, read row by row: of CSV and Parquet, or in memory; every complaint with file and line, or row.
 
-A file is never in memory as a whole.  Units other than kalmark's are told by the end of a column's name (`FACTORS`) and
-never guessed.
+A file is never in memory as a whole.  Units other than kalmark's are recognised by the end of a column's name
+(`FACTORS`) and never guessed.
 """
 
 from __future__ import annotations

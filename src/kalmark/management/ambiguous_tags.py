@@ -31,7 +31,7 @@ SHARE = 100.0  # the poses count a hundredth of what they determine: enough to r
 
 
 class Mirrored:
-    """Starts a tag with an id when one of its two poses fits better beyond doubt."""
+    """Starts a tag with an id when one of its two poses fits better at sufficient odds."""
 
     def observe(self, scan: ScanContext, k: int, pending: Pending) -> Step:
         """Add the evidence of a scan; start the tag if it decides."""

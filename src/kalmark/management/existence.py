@@ -113,7 +113,7 @@ def look(scan: ScanContext, upkeep: Upkeep) -> Look | None:
 
 
 def count_misses(tracks: Tracks, look: Look) -> list[Track]:
-    """Count the sightings and the misses of the landmarks of a look; return those that it missed."""
+    """Count the observations and the misses of the landmarks of a look; return those that it missed."""
     missed = [tracks.confirmed[name] for name in look.missed if name in tracks.confirmed]
     for track in missed:
         track.missed += look.missed[track.id]
@@ -174,7 +174,7 @@ def log_odds(tracks: Sequence[Track], density: Detection, upkeep: Upkeep) -> Arr
 
 
 def _likely(density: Detection, seen: Array | float, out: Array | float) -> Array:
-    """Return the log likelihood (K,) of counts of sightings and misses."""
+    """Return the log likelihood (K,) of counts of observations and misses."""
     a, b = density
     return np.asarray(betaln(a + seen, b + out) - betaln(a, b))
 
@@ -199,7 +199,7 @@ def log_odds_of_map(tracks: Tracks, upkeep: Upkeep) -> dict[Id, float]:
 
 
 def _counts(tracks: Sequence[Track]) -> tuple[Array, Array, Array]:
-    """Return sightings, misses before the last one and misses since then, each (K,)."""
+    """Return observations, misses before the last one and misses since then, each (K,)."""
     found = np.array([(track.seen, track.absent, track.missed) for track in tracks], dtype=np.float64).reshape(-1, 3)
     return found[:, 0], found[:, 1], found[:, 2]
 

@@ -7,9 +7,9 @@ it.
 
     F = 1 - K H on the hypothesis' rows,   Q = K (R + C) K',   C = (h'' P)^2 / 2
 
-h'' is the second derivative in the direction, whose sigma of some 15 degrees a first order does not bear.  What was
-predicted badly loses weight.  A pose error lasts from range to range, so that only the share of white noise in what the
-pose and the range leave open counts as evidence.  docs/range_only.md.
+h'' is the second derivative in the direction, whose sigma of some 15 degrees a first order does not bear.  A hypothesis
+with a bad prediction loses weight.  A pose error lasts from range to range, so that only the share of white noise in
+what the pose and the range leave open counts as evidence.  docs/range_only.md.
 """
 
 from __future__ import annotations

@@ -97,9 +97,10 @@ class MergeSearch:
 def proposal(map_: Map, tracks: Tracks, name: Id, robot: int, sensor: Array, odds: float) -> Merge | None:
     """Return a landmark, and others recently observed, paired with those that they are; None if that is not accepted.
 
-    What it may be is tried one by one: the others, moved along, are paired with their nearest.  Of the hypotheses with
-    most pairs, the one of the largest log ratio must be accepted at these odds against chance and against any other
-    that has no pair in common with it.  `robot` is the slot of a robot, `sensor` (3,) or (7,) the pose of the sensor.
+    Its possible partners are tried one by one: the others, moved along, are paired with their nearest.  Of the
+    hypotheses with most pairs, the one of the largest log ratio must be accepted at these odds against chance and
+    against any other that has no pair in common with it.  `robot` is the slot of a robot, `sensor` (3,) or (7,) the
+    pose of the sensor.
     """
     d = 2 if len(sensor) == 3 else 3
     look, tried = _Reading(map_, tracks, robot, d), []

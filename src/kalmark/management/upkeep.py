@@ -13,8 +13,8 @@ class Upkeep:
 
     An observation without an id that belongs to no landmark starts a *tentative* one, which becomes a landmark when it
     was seen `confirm` times within `within` scans in which it was in the sensor's view, and is dropped when that cannot
-    be any more.  With `confirm` 1 it is one at once.  Its sightings are kept with the last `keep_poses` poses they were
-    made from, and fused when it is confirmed (`confirm.py`); with 0, the first and the confirming one alone count.
+    be any more.  With `confirm` 1 it is one at once.  Its observations are kept with the last `keep_poses` poses they
+    were made from, and fused when it is confirmed (`confirm.py`); with 0, the first and the confirming one alone count.
 
     With `merge`, two landmarks that turn out to be one are merged (`merge.py`) when that is `odds` times
     likelier than that they stand there by chance.  With `hold_back`, so must be what an observation is paired with
@@ -22,7 +22,7 @@ class Upkeep:
     is lost.
 
     With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are
-    searched while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those beyond doubt.
+    searched while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those that are accepted.
 
     A landmark without an id that should be seen and is not is marked, with `gone` "remove" removed, when it is `odds`
     times likelier that nothing is there (`existence.py`).  The detection probability of the sensor
@@ -39,7 +39,7 @@ class Upkeep:
     """
 
     confirm: Annotated[
-        Count, "A tentative landmark becomes one when it was seen so often; 1: at its first sighting."
+        Count, "A tentative landmark becomes one when it was seen so often; 1: at its first observation."
     ] = 3
     within: Annotated[Count, "It is dropped if that did not happen in so many scans in which it was in view."] = 10
     merge: Annotated[bool, "Merge landmarks that turn out to be one."] = True
@@ -49,9 +49,9 @@ class Upkeep:
     ] = "off"
     hold_back: Annotated[
         bool,
-        "Hold back what is not beyond doubt (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map it again.",
+        "Defer observations below the odds (`nearest`, `global`, `jcbb`) or of a lost robot (`auto`); map them again.",
     ] = False
-    odds: Annotated[float, Within(ge=1), "So many times likelier than chance is beyond doubt."] = 100.0
+    odds: Annotated[float, Within(ge=1), "Odds against chance at which a hypothesis is accepted."] = 100.0
     gone: Annotated[Literal["mark", "remove"], "Treatment of landmarks that are no longer observed."] = "mark"
     p_detect: Annotated[
         float | None,
@@ -62,7 +62,7 @@ class Upkeep:
     keep_poses: Annotated[
         int,
         Within(ge=0),
-        "Its sightings are kept with so many past poses, and fused when it is one; 0: they are not used.",
+        "Its observations are kept with so many past poses, and fused when it is one; 0: they are not used.",
     ] = 0
 
     def __post_init__(self) -> None:

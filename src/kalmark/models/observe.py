@@ -4,14 +4,14 @@
     chain(robot, mount, state or clone)     -> expect(sensor)         a sensor of its own robot: `state_view.py`
     compose -> (look, chain)                -> expect(sensor)         one that sees its own velocity, too
 
-What is before `expect` are the links of a chain, one function for each of the three, which goes by its address.
-`expectation` is the readable form of the first.  The filter's kernels call `linearize`: `linearize_chain`, compiled,
-for the built-in models, a `PythonView` for a user's.  Both are tested to be equal.  What is behind the robot's pose in
-the head is, where the map has it, the mount, with the parameters that the sensor has in the map behind it; of a sensor
-that sees its own velocity, whose mount is known, it is the state or a clone, from which its velocity follows.  Of a
-sensor whose lag is in the map, the lag is behind the mount, which is then where it was that long ago.
+The steps before `expect` are one function for each of the three, called by its address.  `expectation` is the readable
+form of the first.  The filter's kernels call `linearize`: `linearize_chain`, compiled, for the built-in models, a
+`PythonView` for a user's.  Both are tested to be equal.  Behind the robot's pose in the head is, where the map has it,
+the mount, with the parameters that the sensor has in the map behind it; of a sensor that sees its own velocity, whose
+mount is known, the state or a clone, from which its velocity follows.  Of a sensor whose lag is in the map, the lag is
+behind the mount, which is then where it was that long ago.
 
-Any of the blocks may be a given value, of which no Jacobian is asked for: a mount that is not in the head, and what
+Any of the blocks may be a given value, for which no Jacobian is computed: a mount that is not in the head, and what
 stands behind the numbers that are measured.  Those are the numbers of a landmark known exactly, and for a sensor of
 the state the time since its last reading and the control in force, or the mean of earlier readings and that time.
 
@@ -448,7 +448,7 @@ def links_of_landmarks(view: View, head: Array, l: Array, given: Array) -> Links
 def links_of_moving(view: View, head: Array, l: Array, given: Array) -> Links:
     """Return the views (K, 2 d) of landmarks with the velocity t of their sensor behind each, V_T, T_h and V_l.
 
-    What is between is the sensor's pose T and t, which depends on the block behind the robot's pose in the head.
+    Between them is the sensor's pose T and t, which depends on the block behind the robot's pose in the head.
     """
     at = view[MOUNT]
     pose = len(at)

@@ -296,7 +296,7 @@ def tag_problem(run: Recording) -> Problem:
     rows = np.flatnonzero(history.fused & np.isin(history.landmark, list(ids)))
     rows = rows[[(history.robot[history.step[row]], history.sensor[row]) in cameras for row in rows]]
     if not len(rows):
-        raise KalmarkError("tags: no camera saw the corners of a tag in the map, expected sightings of TagCorners")
+        raise KalmarkError("tags: no camera saw the corners of a tag in the map, expected observations of TagCorners")
     steps, first, scan = np.unique(history.step[rows], return_index=True, return_inverse=True)
     names, index = [ids[name] for name in history.landmark[rows].tolist()], np.arange(len(rows)) - first[scan]
     t_ns, robot, sensor = history.t_ns[steps], history.robot[steps], history.sensor[rows]

@@ -28,7 +28,7 @@ from kalmark.results.scene import (
     INK,
     OUTCOME_COLOURS,
     Image,
-    Sighting,
+    ImageObservation,
     Style,
     clip_line,
     colour_of,
@@ -162,7 +162,7 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     pictures, options = Pictures(run), picture_of(run)
     for axes, image in zip(grid, seen, strict=True):
         draw_image(axes, image, camera.size, options, pictures.at(camera, int(steps[-1]), image.side))
-    title = scan_title(camera, history.t_s[steps[-1]], [s.outcome for s in seen[0].sightings])
+    title = scan_title(camera, history.t_s[steps[-1]], [s.outcome for s in seen[0].observations])
     add_title_and_legend(figure, title, legend(seen, options))
     return figure
 
@@ -181,13 +181,15 @@ def draw_image(axes: Axes, image: Image, size: tuple[float, float], options: Pic
     axes.tick_params(colors="#555b66", labelsize=8)
     if image.side:
         axes.set_title(f"{image.side} image", fontsize=10, color="#555b66")
-    named = picture is None or len(image.sightings) <= MOST_NAMES
+    named = picture is None or len(image.observations) <= MOST_NAMES
     measured = MEASURED if picture is None else ON_IMAGE
-    for sighting in image.sightings:
-        _draw(axes, sighting, size, named, options, measured)
+    for observation in image.observations:
+        _draw(axes, observation, size, named, options, measured)
 
 
-def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, options: Picture, point: str) -> None:
+def _draw(
+    axes: Axes, s: ImageObservation, size: tuple[float, float], named: bool, options: Picture, point: str
+) -> None:
     colour, _ = colour_of(s, options)
     expected, single = np.isfinite(s.expected).all(), len(s.expected) == 1
     closed = np.vstack([s.measured, s.measured[:1]]) if len(s.measured) > 2 else s.measured
@@ -209,7 +211,7 @@ def _draw(axes: Axes, s: Sighting, size: tuple[float, float], named: bool, optio
         name_points(axes, at[None], [s.name], zorder=7, fontsize=7, color=NAME)
 
 
-def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: str, rejected: bool) -> None:
+def _draw_expected(axes: Axes, s: ImageObservation, size: tuple[float, float], colour: str, rejected: bool) -> None:
     style: Style = {"color": colour, "linewidth": 1.1, "linestyle": "--" if rejected else "-", "zorder": 5}
     if len(s.expected) == 1:
         axes.plot(*s.expected.T, ".", color=colour, markersize=3, zorder=5)
@@ -227,16 +229,16 @@ def _draw_expected(axes: Axes, s: Sighting, size: tuple[float, float], colour: s
 
 def legend(seen: list[Image], options: Picture) -> list[Line2D]:
     """Return the entries of the legend: only what there is."""
-    sightings = [s for image in seen for s in image.sightings]
-    lines = any(len(s.measured) > 1 for s in sightings)
+    observations = [s for image in seen for s in image.observations]
+    lines = any(len(s.measured) > 1 for s in observations)
     mark: Style = {"linewidth": 3, "alpha": 0.55} if lines else {"marker": "+", "linestyle": ""}
     colour = options.colour("measured", SEGMENT if lines else MEASURED)
     out = [Line2D([], [], color=colour, label="measured", **mark)]
-    found = dict.fromkeys(colour_of(s, options) for s in sightings if np.isfinite(s.expected).all())
+    found = dict.fromkeys(colour_of(s, options) for s in observations if np.isfinite(s.expected).all())
     out += [Line2D([], [], color=c, label=label if lines else f"{label}, 3σ") for c, label in sorted(found)]
-    if any(s.outcome == "new" for s in sightings):
+    if any(s.outcome == "new" for s in observations):
         square: Style = {"marker": "s", "markerfacecolor": "none", "linestyle": ""}
         out.append(Line2D([], [], color=NAME, label="new landmark", **square))
-    if any(s.outcome == "rejected" for s in sightings):
+    if any(s.outcome == "rejected" for s in observations):
         out.append(Line2D([], [], color=INK, marker="x", linestyle="", label="rejected"))
     return out

@@ -48,8 +48,8 @@ from kalmark.results.plot import BEHIND, Projection
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
     POINTS,
+    ImageObservation,
     Scene,
-    Sighting,
     break_path,
     colour_of,
     gaps_in,
@@ -283,7 +283,7 @@ def _camera(
         seen = []
         for image in images(run.history, camera, step):
             picture = pictures.uri(camera, step, image.side)
-            seen.append({"side": image.side, "seen": [_seen(sighting, options) for sighting in image.sightings]}
+            seen.append({"side": image.side, "seen": [_seen(one, options) for one in image.observations]}
                         | ({"picture": picture} if picture else {}))  # fmt: skip
         scans.append({"t": round(float(t[step]), 3), "images": seen})
     frames = [int(np.searchsorted(used, k)) if k >= 0 else None for k in last]
@@ -291,7 +291,7 @@ def _camera(
     return {"name": f"{camera.robot} · {camera.sensor}", "size": size, "scans": scans, "frames": frames}
 
 
-def _seen(s: Sighting, options: Picture) -> Data:
+def _seen(s: ImageObservation, options: Picture) -> Data:
     colour, meaning = colour_of(s, options)
     colour = to_hex(colour)
     out: Data = {"name": s.name, "outcome": s.outcome, "y": [round_values(p, 2) for p in s.measured]}

@@ -402,7 +402,7 @@ def drawn_box(
     return low, high
 
 
-class Sighting(NamedTuple):
+class ImageObservation(NamedTuple):
     """One observation in one image: its name, what became of it, what was measured and what was expected.
 
     `measured` and `expected` (V, 2) are pixels, one row a point; without an expectation the latter is NaN.  `Z` (2, 2)
@@ -422,7 +422,7 @@ class Image(NamedTuple):
     """One image of a scan: "left", "right" or "" for the only one, and all that was seen in it."""
 
     side: str
-    sightings: list[Sighting]
+    observations: list[ImageObservation]
 
 
 def images(history: History, camera: Camera, step: int) -> list[Image]:
@@ -464,13 +464,13 @@ def _images(camera: Camera, seen: Iterable[tuple[Any, ...]]) -> list[Image]:
         for image, at in zip(found, points.values(), strict=True):
             Z_at = Z[np.ix_(at[0], at[0])] if whole and len(at) == 1 else np.full((2, 2), np.nan)
             y_at = measured[0][at] if measured else np.empty((0, 2))
-            image.sightings.append(Sighting(name, outcome, euclidean, y_at, e[at], Z_at))
+            image.observations.append(ImageObservation(name, outcome, euclidean, y_at, e[at], Z_at))
     return found
 
 
-def colour_of(sighting: Sighting, picture: Picture) -> tuple[str, str]:
+def colour_of(observation: ImageObservation, picture: Picture) -> tuple[str, str]:
     """Return the colour of an expectation and what it means."""
-    name, usual, meaning = EXPECTED[sighting.euclidean, sighting.outcome == "associated"]
+    name, usual, meaning = EXPECTED[observation.euclidean, observation.outcome == "associated"]
     return picture.colour(name, usual), meaning
 
 

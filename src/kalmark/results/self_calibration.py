@@ -2,7 +2,8 @@
 
 The posterior covariance P of a mount is compared with its prior C: the eigenvectors of C^-1/2 P C^-1/2 are directions
 in units of the prior's sigmas, the eigenvalues by how much each has become better known.  An eigenvalue near 1 belongs
-to a direction that nothing told of.  C^-1/2 is the symmetric root: directions stay near the axes they are named by.
+to a direction that no measurement determined.  C^-1/2 is the symmetric root: directions stay near the axes they are
+named by.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
-"""Warnings of a run: doubts about its figures, and noise that is stated too large, one line each.
+"""Warnings of a run: figures that may be wrong, and noise that is stated too large, one line each.
 
-Is the map wrong from some time on?  A filter on a wrong map contradicts itself: innovations that are too large or keep
-their signs, and observations that fit nothing.  So NIS, observations left out and the whiteness of innovations are
-taken in windows of time.  Bar-Shalom, Li, Kirubarajan 2001, section 5.4: time-average NIS and autocorrelation of the
-innovations.
+Signs of a wrong map: innovations that are too large or keep their signs, and observations that fit no landmark.  NIS,
+observations left out and the whiteness of innovations are taken in windows of time.  Bar-Shalom, Li, Kirubarajan 2001,
+section 5.4: time-average NIS and autocorrelation of the innovations.
 
-Is a noise too large?  An innovation has the noise of its measurement in it, and the uncertainty of pose and map on top:
-E[z z'] = H P H' + R is at least R for every P.  If the mean square of z is far below R, R is therefore too large, at
-least by their ratio.  This does not hold for errors that are correlated from one sighting to the next: the map absorbs
-those, and a larger white noise stands for them.  So there is no such warning where the truth shows that the filter is
-overconfident.
+Signs of a noise that is too large: an innovation has the noise of its measurement in it, and the uncertainty of pose
+and map on top: E[z z'] = H P H' + R is at least R for every P.  If the mean square of z is far below R, R is therefore
+too large, at least by their ratio.  This does not hold for errors that are correlated from one observation to the next:
+the map absorbs those, and a larger white noise stands for them.  So there is no such warning where the truth shows that
+the filter is overconfident.
 """
 
 from __future__ import annotations
@@ -519,5 +518,5 @@ def _compared(history: History, sensor: str, mine: Any, columns: tuple[str, ...]
     share = figure(float(np.nansum(value) / dof.sum()), 2)
     yield (
         f"sensor {sensor}: NIS {share} where 1 is expected: its {told[0]} stated about {told[1]} too large, "
-        "unless its errors last from one sighting to the next"
+        "unless its errors last from one observation to the next"
     )

@@ -62,7 +62,7 @@ class Scenery:
     of the points by number, None where the layout has none.
 
     `raw_of`, of a plug-in's layout, returns of a sensor and its `sensing` what makes its raw data from its pose (7,),
-    the time in ns, the names of robot and sensor, and a seed.  What they show is between the `corners` (N, 3).
+    the time in ns, the names of robot and sensor, and a seed.  Its content is between the `corners` (N, 3).
     """
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))

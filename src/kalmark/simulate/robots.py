@@ -88,7 +88,7 @@ class SimSensor:
 class SimRobot:
     """A robot: its model, and what it carries.
 
-    `states` (steps + 1, n) are the true ones, `poses` (steps + 1, 3 or 7) a view of them, `told` (steps, m) the
+    `states` (steps + 1, n) are the true ones, `poses` (steps + 1, 3 or 7) a view of them, `given` (steps, m) the
     controls that its estimator is given, `done` those that moved it; by `constants` (c,) all controls are wrong.
     """
 
@@ -97,7 +97,7 @@ class SimRobot:
     sensors: dict[str, SimSensor]
     states: Array
     poses: Array
-    told: Array
+    given: Array
     done: Array
     course: Course
     target: Array
@@ -154,7 +154,7 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
             events.append(scan if robot.sensors[name].raw is None else raw_of(robot, name, 0, 0, chance))
     for robot in robots:
         at = times[:-1] if robot.motion.held else times[1:]
-        events += [Control(t_ns=t_ns, robot=robot.name, u=u) for t_ns, u in zip(at, robot.told, strict=True)]
+        events += [Control(t_ns=t_ns, robot=robot.name, u=u) for t_ns, u in zip(at, robot.given, strict=True)]
     for steps in spans(world, robots, things):
         for robot in robots:
             for k, name, y, ids, real in sensor_scans(robot, robots, things, world, steps, chance):
@@ -237,9 +237,9 @@ def sim_robot(world: World, robot: Robot, area: Array, chance: Chance, scenery: 
     course = simulated.route.course(world.steps, world.dt_s, area, chance.route)
     model = self_calibrating(motion)
     constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
-    told, done = np.empty((2, world.steps, len(motion.columns)))
+    given, done = np.empty((2, world.steps, len(motion.columns)))
     poses = states[:, : 3 if world.dimensions == 2 else 7]
-    return SimRobot(robot.name, motion, sensors, states, poses, told, done, course, next(course[1]), constants)
+    return SimRobot(robot.name, motion, sensors, states, poses, given, done, course, next(course[1]), constants)
 
 
 def draw_start(robot: Robot, rng: Generator) -> Array:
@@ -298,7 +298,7 @@ def drive_all(
     centres = np.concatenate(places or [np.zeros((1, things[POINTS].dimensions))])
     area = np.array([centres.min(axis=0), centres.max(axis=0)])
     driven = [sim_robot(world, robot, area, chance, scenery) for robot in robots]
-    z = chance.control.standard_normal(sum(r.told.size + world.steps * r.motion.space.dof for r in driven))
+    z = chance.control.standard_normal(sum(r.given.size + world.steps * r.motion.space.dof for r in driven))
     all_ways = [ways or python_ways(robot.motion, dt_s) for robot in robots]
     leg, at = drive_leg if ways else python_form(drive_leg), 0
     stride = world.steps if len(driven) == 1 else 1  # robots share their chance
@@ -308,12 +308,12 @@ def drive_all(
             while k < last:
                 r.target = aim(r.target, ahead, 2 * limits[1], r.states[k])
                 course, rules = (controls, r.target, limits), (dt_s, world.noise_on == "robot")
-                k, at = leg(by, course, (z, at), (k, last), rules, (r.states, r.told, r.done))
+                k, at = leg(by, course, (z, at), (k, last), rules, (r.states, r.given, r.done))
     for r in driven:
         for carried in r.sensors.values():
             carried.frames = sensor_poses(r.poses, carried.at)
         if len(r.constants):
-            r.told = np.array([given_control(r.motion, u, r.constants, dt_s) for u in r.told])
+            r.given = np.array([given_control(r.motion, u, r.constants, dt_s) for u in r.given])
     return driven, things
 
 

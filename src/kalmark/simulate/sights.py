@@ -1,7 +1,7 @@
 """Simulated measurements from true poses, right or wrong.
 
-What is seen is judged without noise, and noise is added afterwards: a measurement may so come to lie beyond the border
-of the image, but its noise is that of the sensor everywhere.  ([TB] adds it before and cuts what falls outside.)
+Visibility is decided without noise, and noise is added afterwards: a measurement may so be beyond the border of the
+image, but its noise is that of the sensor everywhere.  ([TB] adds it before and cuts what falls outside.)
 """
 
 from __future__ import annotations

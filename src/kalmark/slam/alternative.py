@@ -1,4 +1,4 @@
-"""The other explanation of readings that do not fit: that the robot is elsewhere than the map has it.
+"""Second hypothesis of a robot's pose: a filter of the robot alone, started at measurements that the map rejects.
 
 Where readings have placed a robot, some that do not fit are wrong, as those of a receiver that jumps, or the robot is
 lost: its wheels slipped, it was carried away, its inertial unit was wrong for a second.  One reading does not

@@ -1,6 +1,6 @@
-"""The short way of a scan of which nothing is to be decided: its ids are of landmarks of one type in the map.
+"""Correction by a scan whose ids all name landmarks of one type in the map: no association, no new landmark.
 
-It is `Slam._fuse` and `maintain` without what they would not do then.
+It leaves out the stages of `Slam._fuse` and `maintain` that have no effect on such a scan.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A robot that is elsewhere than its filter has it: found by evidence, placed where the log fits better.
 
 A covariance does not show that a robot was carried away.  The log does (`evidence.py`).  From - `SURE` on a pose is
-looked for at which the scan, and what was mapped since the onset, is that of old landmarks: by a tag, by points or
+searched for at which the scan, and what was mapped since the onset, is that of old landmarks: by a tag, by points or
 rays with ids, or by distances (`association/global_start.py`).  A second filter of the robot alone begins there, an
 `Alternative`, on the old map as it is, with the same ratio.  Where both differ by log `ODDS` the robot is placed there;
 what was mapped meanwhile goes.
@@ -116,7 +116,7 @@ def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> l
 
 
 def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
-    """Take note of the landmarks that a scan saw and missed, and place its robot where that is beyond doubt."""
+    """Count the landmarks that a scan observed and missed, and place its robot where the odds suffice."""
     robot = scan.event.robot
     if look is not None or scan.adrift:
         state.evidence.setdefault(robot, Evidence())

@@ -69,7 +69,7 @@ class MotionPart(NamedTuple):
 class RateMean(NamedTuple):
     """The mean (k,) of the last controls or readings, as rates: of a `number` that differ by their noise alone.
 
-    What a constant does is proportional to a control, or to a reading as it is expected after one.  Of the measured
+    The effect of a constant is proportional to a control, or to a reading as it is expected after one.  Of the measured
     control it would be correlated with the control's noise, and where another sensor shows that noise the constant
     would be wrong: errors in variables.  Earlier ones are as large and have other noise: an instrumental variable
     (Fuller 1987, section 1.4).

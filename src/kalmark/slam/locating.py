@@ -164,7 +164,7 @@ def can_be_summed(channel: Channel) -> bool:
 
 
 def is_doubted(state: State, scan: ScanContext) -> bool:
-    """Begin a sum of where else a robot may be that its sightings contradict; return whether there is one."""
+    """Start a Gaussian sum for a robot whose ranges do not fit its pose.  Return whether it has one."""
     name = scan.event.robot
     if not (can_be_summed(scan.channel) and distances_alone(scan.channel.sensor)):
         return False

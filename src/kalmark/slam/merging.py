@@ -96,7 +96,7 @@ def _difference(state: State, pair: tuple[Id, Id]) -> Start:
 
 
 def search_repeats(state: State, scan: ScanContext, policy: Policy) -> None:
-    """Search the map for parts that are one; merge those beyond doubt, if the policy merges, and report the others.
+    """Search the map for parts that are one; merge those that are accepted, if the policy merges; report the others.
 
     One is merged at a time: it changes the map.
     """

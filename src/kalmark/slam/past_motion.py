@@ -1,4 +1,4 @@
-"""The last motions of a robot, for sensors whose stamps are late: where the robot was when they saw what they show.
+"""The last motions of a robot, for sensors whose stamps are late: the pose of the robot at the measurement.
 
 The lag is estimated with the map, behind the mount of its sensor (`models/observe.py`).  About its mean the mount is
 where the motions of that time have it.  How it changes with the lag is the mean twist of an interval about that time,

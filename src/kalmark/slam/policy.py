@@ -43,7 +43,7 @@ class Policy:
     may answer with mixtures; `holds_back`: its pairs are tested against chance; `reviews`: landmarks may change after a
     scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the
     last `keep_poses` clones are kept for tentative landmarks.  `restarts`: rays may have to be started again
-    (`baselines.py`).  `contests`: where a landmark with an id was begun is weighed against sightings that do not fit
+    (`baselines.py`).  `contests`: where a landmark with an id was begun is weighed against observations that do not fit
     (`tentative.py`), which are left out or count less.
     `by_ids`: nothing is to be decided of a scan whose ids are of landmarks of one type in the map.
     """

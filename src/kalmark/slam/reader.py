@@ -179,7 +179,7 @@ class StateReader:
     def estimator(self, estimator: Estimator, is_loop: bool) -> Estimator:
         """Return how a reading is fused: absolute poses and loops with iterations, how the robot moved without.
 
-        What one step was is a new unknown each time, constants of the sensor are not.  The iterated estimate is the
+        The motion of a step is a new unknown each time, constants of the sensor are not.  The iterated estimate is the
         mode of all of them together, which is no mode of the constants (docs/state_sensors.md).
         """
         if self.sensor.views == POSE:

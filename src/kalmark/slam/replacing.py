@@ -3,10 +3,10 @@
 Fixes are positions of the robot, or those of an antenna on it, which a sensor of the state measures.
 
 A fix outside its gate is left out.  A filter that has lost its robot would leave out all of them.  So the last fixes
-that were left out, one after the other, are compared with the estimated positions of the robot: if a shift and a
-turn about the vertical axis lead from there to all of them, within their noise, the robot is moved by it, or,
-where fixes have fitted before, an `alternative` begins there.  What that does not determine, and all correlation of the
-robot with the map, is dropped.
+that were left out, one after the other, are compared with the estimated positions of the robot: if a shift and a turn
+about the vertical axis lead from there to all of them, within their noise, the robot is moved by it, or, where fixes
+have fitted before, an `alternative` begins there.  Components that this does not determine, and all correlation of the
+robot with the map, are dropped.
 
 If nothing has determined yet where the map is in the world, no survey and fewer fixes that fitted than must agree, it
 was the start that was wrong: then the whole map is moved with the robot.  Its covariance gets that of the shift and of

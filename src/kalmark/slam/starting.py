@@ -68,7 +68,7 @@ def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name:
         track.first = scan.event.t_ns, *scan.key, k
     if held:
         return Observation(k, None, "deferred", name, None, reason)
-    why = f"first sighting: {reason}" if reason else "first sighting"
+    why = f"first observation: {reason}" if reason else "first observation"
     return Observation(k, None, "tentative", name, None, why)
 
 

@@ -20,13 +20,13 @@ from kalmark.tracks.linearity import turn_holds
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.surveys import SURVEYED
 
-ELSEWHERE = "its sightings do not fit its survey, while those of others do: it is mapped again"
+ELSEWHERE = "its observations do not fit its survey, those of other landmarks do: it is mapped again"
 WIDER = 2.0  # times what a robot that was elsewhere has moved by
 DOUBLED = 20  # times at most that a robot is moved by one scan, each time farther
 
 
 def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
-    """Return the gate of sightings of surveyed landmarks; infinite while no turn of their robot is linear."""
+    """Return the gate of observations of surveyed landmarks; infinite while no turn of their robot is linear."""
     least = policy.association.threshold(scan.channel.dof, gate(SURVEYED, scan.channel.dof))
     if least == math.inf:
         return least
@@ -37,17 +37,17 @@ def gate_of(state: State, scan: ScanContext, policy: Policy) -> float:
 def is_tried(state: State, robot: str, names: Sequence[Any]) -> bool:
     """Return whether a scan tests surveys: those on trial, or landmarks that did not fit before."""
     trial = state.surveys.trial.keys()
-    return bool(state.surveys.strangers.get(robot)) or (bool(trial) and not trial.isdisjoint(names))
+    return bool(state.surveys.misfitting.get(robot)) or (bool(trial) and not trial.isdisjoint(names))
 
 
 def correct_by_surveys(
     state: State, scan: ScanContext, names: Sequence[Any], update: Update, least: float,
     estimator: Estimator, approach: Callable[[Sequence[int], float], bool],
 ) -> Correction:  # fmt: skip
-    """Correct by sightings of which some are of surveys; of these the ones beyond `least` are left out.
+    """Correct by observations.  Those of surveyed landmarks beyond the gate `least` are rejected.
 
-    They are taken all the same if it is the robot that is elsewhere, unless they are outside the association's gate.
-    `approach` corrects beforehand by those of some that are far from what is expected, within a gate, if there are any.
+    They are used if the evidence is that the robot, not the survey, is wrong, unless the association's gate rejects
+    them.  `approach` corrects beforehand by those that are far from their expectation, within a gate, if there are any.
     """
     if least == math.inf:
         return state.corrected(update, scan.event, estimator)

@@ -1,8 +1,8 @@
 """Tentative landmarks: compared with what no landmark explains, confirmed with what was kept of them, or dropped.
 
-A tentative landmark may also be the other place of a landmark with an id: a sighting that does not fit begins it, as a
-wrong first sighting is followed by right ones.  Each further sighting fits one place or the other, and the one that
-it does not fit has to have it as an outlier.  Once the other place is beyond doubt, it is the landmark's.
+A tentative landmark may also be a second hypothesis for the place of a landmark with an id.  An observation that does
+not fit the first place starts it, because the first observation may have been the outlier.  Each further observation
+fits one of both places and is an outlier of the other.  The second place replaces the first at sufficient odds.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Late, Status, Track
 
-OUTLIER = math.log(0.95 / 0.05)  # the log odds that one sighting with an id is right
-WITHIN = 0.9999  # of right sightings fit
-ELSEWHERE = "its first sightings are outliers: it is where the later ones have it"
+OUTLIER = math.log(0.95 / 0.05)  # the log odds that one observation with an id is right
+WITHIN = 0.9999  # of right observations fit
+ELSEWHERE = "its first observations are outliers: moved to the place of the later ones"
 
 
 def confirm_tentative(state: State, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision],

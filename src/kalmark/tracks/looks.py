@@ -1,4 +1,4 @@
-"""Looks of a sensor at the landmarks about it, and its detection probability over the field of view, counted in them.
+"""Detection probability of a sensor over its field of view, counted in scans from different poses (looks).
 
 A look is a scan from another pose than the last one, or after many from one pose: scans in a row miss a landmark for
 the same reason.  The detection probability depends on the range, the bearing and on objects that stand nearer; each is

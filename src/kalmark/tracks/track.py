@@ -79,7 +79,7 @@ class Track:
     compared with others.  `extent` (2,) are the abscissas of the segment observed of a line, `size_m` is the measured
     size of a tag.  `first` is the observation that started it, and
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
-    `entered` counts the changes of the map before it came into it.  A tentative one may be where sightings `of` a
+    `entered` counts the changes of the map before it came into it.  A tentative one may be where observations `of` a
     landmark have it that do not fit that: then `log_odds` are those that it is right, and `covisible` are the landmarks
     entered before it that fitted meanwhile.  `classes` are the log-likelihoods of the classes that it may be of.
     """

@@ -269,10 +269,10 @@ class Stream:
             self.put(f"{entity}/pixels", rr.Image(picture).compress(jpeg_quality=QUALITY))
         else:
             self.put(f"{entity}/border", rr.Boxes2D(mins=[[0, 0]], sizes=[size], colors=rgb(TRUTH_COLOUR)))
-        measured = [(point, s.outcome) for s in image.sightings for point in s.measured]
+        measured = [(point, s.outcome) for s in image.observations for point in s.measured]
         colours = [rgb(OUTCOME_COLOURS.get(outcome, INK)) for _, outcome in measured]
         self.put(f"{entity}/measured", rr.Points2D([point for point, _ in measured], colors=colours, radii=2.5))
-        expected = [s for s in image.sightings if len(s.expected) and np.isfinite(s.expected).all()]
+        expected = [s for s in image.observations if len(s.expected) and np.isfinite(s.expected).all()]
         strips = [
             contours(s.expected, s.Z[None], self.picture.sigmas)[0, 0]
             if len(s.expected) == 1 and np.isfinite(s.Z).all()

@@ -39,14 +39,14 @@ class View:
 
 
 class Looks(NamedTuple):
-    """Expected appearance of K landmarks: `templates` (K, s, s), of which those `told` (n,) hold.
+    """Expected appearance of K landmarks: `templates` (K, s, s), of which those `valid` (n,) hold.
 
     `likeness` (K, 2) is the cosine of the angle between the directions of view and the scale, of the best view of each.
     `rates` (K, 2, 2, 2): the slopes of the plane move what appears at x from the centre by rates x.
     """
 
     templates: Any
-    told: Index
+    valid: Index
     likeness: Array
     rates: Array
 
@@ -92,13 +92,13 @@ def predict_templates(
     best, likeness = best_views(views, places, T)
     templates, done = np.zeros((len(best), 2 * h + 1, 2 * h + 1), np.uint8), []
     rates = np.zeros((len(best), 2, 2, 2))
-    told = [
+    valid = [
         k for k, view in enumerate(best)
         if view is not None and likeness[k, 0] > LEAST_COSINE and 1 / MOST_SCALE < likeness[k, 1] < MOST_SCALE
     ]  # fmt: skip
-    if not told:
+    if not valid:
         return Looks(templates, np.zeros(0, np.int64), likeness, rates)
-    shown = [(view, plane) for view, plane in ((best[k], planes[k]) for k in told) if view and plane]
+    shown = [(view, plane) for view, plane in ((best[k], planes[k]) for k in valid) if view and plane]
     turns = np.array([matrix(view.T[3:]) for view, _ in shown])
     normals = np.array([plane.normal for _, plane in shown])[:, None] + DIFFERENCE * (
         STEPS @ np.array([plane.across for _, plane in shown]).transpose(0, 2, 1)
@@ -106,7 +106,7 @@ def predict_templates(
     c = np.array([view.T[:3] for view, _ in shown])
     rays = np.array([view.rays for view, _ in shown]) @ turns.transpose(0, 2, 1)
     along = normals @ rays.transpose(0, 2, 1)
-    far = normals @ (places[told] - c)[:, :, None]
+    far = normals @ (places[valid] - c)[:, :, None]
     X = c[:, None, None] + rays[:, None] * (far / np.where(along > 0.0, along, np.nan))[..., None]
     seen = (X.reshape(-1, 3) - T[:3]) @ matrix(T[3:])
     pixels = sensor.expect(np.ascontiguousarray(seen))[0][:, :2].reshape(-1, 3, 5, 2)
@@ -115,8 +115,8 @@ def predict_templates(
     from_centre = offsets[finite, :1].transpose(0, 1, 3, 2)  # (n, 1, 2, 4)
     moved = (offsets[finite, 1:] - offsets[finite, :1]) / DIFFERENCE
     fitted = np.linalg.solve(from_centre @ from_centre.transpose(0, 1, 3, 2), from_centre @ moved)
-    rates[np.array(told)[finite]] = fitted.transpose(0, 1, 3, 2)
-    for i, k in enumerate(told):
+    rates[np.array(valid)[finite]] = fitted.transpose(0, 1, 3, 2)
+    for i, k in enumerate(valid):
         view = best[k]
         assert view is not None
         to = offsets[i, 0] + h

@@ -156,7 +156,7 @@ def fit_poses(sensor: Any, rays: Array, y: Array, w: Array, t: Array, rho: Array
 def residuals(sensor: Any, rays: Array, y: Array, seen: Flags, x: Array) -> tuple[Array, Array]:
     """Return e - y of what was `seen` (F, N), (2 M,), at x = (w, t, rho), (6 F + N,), and its Jacobian.
 
-    What is behind the camera counts as at the side.
+    A point behind the camera counts as at the side.
     """
     count = len(y)
     w, t = x[: 6 * count].reshape(2, count, 3)

@@ -108,7 +108,7 @@ class FrontEnd:
         self.selection: Selection | None = None
         self.prospect: Prospect | None = None
         self.image: Any = None
-        self.sighting: Found | None = None
+        self.observation: Found | None = None
 
     @property
     def begins(self) -> bool:
@@ -151,7 +151,7 @@ class FrontEnd:
         )
         self.beside = beside if isinstance(self.sensor, PixelDepth) else None
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
-        search, drifted = Search(prospect, looks.told, searcher, settings.updates), None
+        search, drifted = Search(prospect, looks.valid, searcher, settings.updates), None
         found = self.selection = search.run(self.random)
         again = self._matched_again(image, prospect, searcher)
         if again is not None and search.run_again(*again).wider > 1.0:
@@ -174,8 +174,8 @@ class FrontEnd:
             y, cov, ids = y[there], cov[there], [ids[k] for k in there.tolist()]
         scan = Scan(t_ns=raw.t_ns, robot=raw.robot, sensor=raw.sensor, y=y if len(y) else (), ids=ids or None,
                     cov=cov if len(y) else None)  # fmt: skip
-        self.sighting = Found(scan, removed, drifted)
-        return self.sighting
+        self.observation = Found(scan, removed, drifted)
+        return self.observation
 
     def update(self, report: Report, view: FilterView) -> Replay | None:
         """Update patches and counts of landmarks by the report of a frame; return what is to be filtered again."""
@@ -209,10 +209,10 @@ class FrontEnd:
         for name, _ in report.removed:
             self.looks.pop(name, None)
         if self.beginning is not None:
-            assert self.sighting is not None
+            assert self.observation is not None
             fitted = {o.landmark: report.y[o.index] for o in report.observations
                       if o.landmark is not None and o.outcome in ("new", "associated")}  # fmt: skip
-            self.beginning.add(self.sighting.scan, [name for name, _ in self.sighting.removed], fitted, T)
+            self.beginning.add(self.observation.scan, [name for name, _ in self.observation.removed], fitted, T)
         return self._begun(view.channel.landmark)
 
     # ------------------------------------------------------------------ the beginning
@@ -280,7 +280,7 @@ class FrontEnd:
         found = self.selection
         if self.frame % EVERY or found is None:
             return None
-        looks = [(k, self.looks[prospect.names[k]]) for k in self.likely.told.tolist()]
+        looks = [(k, self.looks[prospect.names[k]]) for k in self.likely.valid.tolist()]
         old = np.array([k for k, look in looks if look.fitted >= TRIAL and self.frame - look.seen > AWAY], np.int64)
         if len(old) < ENOUGH or found.matched[old].sum() > len(old) / 2:
             return None
@@ -321,7 +321,7 @@ class FrontEnd:
     def _add_shifts(self, R: Array, y: Array, rows: list[int]) -> None:
         """Add to the noise R (n, m, m) of y (n, m), first landmarks `rows`, what the image leaves open of the pixels.
 
-        What slides at the edge of a thing counts less.  The right image of a pair is searched for what the left one
+        A match that slides along an edge counts less.  The right image of a pair is searched for what the left one
         shows at the match: both err by the same shift.
         """
         n, which = len(rows), np.array(rows, dtype=np.int64)

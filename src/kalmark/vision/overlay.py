@@ -23,8 +23,9 @@ def overlay(front_end: FrontEnd | LineFrontEnd, report: Report, scale: int = 1) 
     """Return the last frame (H, W, 3), blue, green and red, `scale` times as large, with what was searched and found.
 
     Search ellipses of three sigmas in yellow where the landmark was found, in red where it was not; matches are green
-    dots, those that the filter rejected magenta; new landmarks are blue circles.  What agreed with the base of the
-    one-point RANSAC was not searched in an ellipse.  Lines are drawn in the same colours, as expected and as measured.
+    dots, those that the filter rejected magenta; new landmarks are blue circles.  Matches that agreed with the base of
+    the one-point RANSAC were not searched in an ellipse.  Lines are drawn in the same colours, as expected and as
+    measured.
 
     >>> found = km.landmarks.Homogeneous(prior_rho_per_m=0.5, sigma_rho_per_m=0.25)
     >>> eye = km.Mount(km.sensors.PinHole(), landmark=found, detector=km.vision.ActiveSearch())

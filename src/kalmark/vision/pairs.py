@@ -1,9 +1,9 @@
 """The second image of a rectified pair: where it shows what was found in the first one, a measurement (ul, vl, ur, vr).
 
 The surroundings of a pixel of the left image are searched along its row of the right one by the same correlation: a
-landmark where the filter expects it by then, a new one over all disparities of its prior, and from there back again.
-What is not found so counts by its left pixel alone: its disparity is as expected with a sigma of `UNKNOWN`; that of a
-new landmark is the prior of its type.
+landmark where the filter expects it by then, a new one over all disparities of its prior, and from there back again.  A
+landmark that is not found so counts by its left pixel alone: its disparity is as expected with a sigma of `UNKNOWN`;
+that of a new landmark is the prior of its type.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ the centre as the camera moves round, as if the landmark moved, in each frame.  
     N.(X - p) = 0,  N = m + B s,
 
 m the direction in which p was first seen, B (3, 2) across it, s (2,) the slopes.  Where the patch appears at x from p,
-slopes changed by ds move it by x_s ds.  What a match shows about its pixel is I(x) = g T(x) + o - T_x (x_s ds + t):
+slopes changed by ds move it by x_s ds.  The image of a match about its pixel is I(x) = g T(x) + o - T_x (x_s ds + t):
 least squares over template and image give ds, beside gain g, offset o and shift t, all frames together those of most
 parallax.  A depth image shows the plane at once: 1 / z = N.v of the rays v with z = 1.
 """

@@ -45,10 +45,10 @@ class Selection:
 
 
 class Search:
-    """One search of an image for the landmarks of a prospect; `told` (n,) are those of which there is a template."""
+    """One search of an image for the landmarks of a prospect; `valid` (n,) are those of which there is a template."""
 
-    def __init__(self, prospect: Prospect, told: Index, searcher: Searcher, updates: int) -> None:
-        self.prospect, self.told, self.searcher, self.updates = prospect, told, searcher, updates
+    def __init__(self, prospect: Prospect, valid: Index, searcher: Searcher, updates: int) -> None:
+        self.prospect, self.valid, self.searcher, self.updates = prospect, valid, searcher, updates
         self.sigma = np.sqrt(np.diagonal(prospect.R, axis1=1, axis2=2)[:, :PIXEL].max(axis=1, initial=0.0))
         k = len(prospect)
         self.found = Selection(
@@ -58,7 +58,7 @@ class Search:
 
     def run(self, random: np.random.Generator) -> Selection:
         """Return the matches."""
-        if len(self.told):
+        if len(self.valid):
             self._consensus(random)
             self._active()
         return self.found
@@ -83,7 +83,7 @@ class Search:
         found, prior = self.found, self.prospect.belief
         best, best_y = np.zeros(0, np.int64), np.zeros((0, 2))
         needed = float(TRIES)
-        for base in random.permutation(self.told)[:TRIES].tolist():
+        for base in random.permutation(self.valid)[:TRIES].tolist():
             if found.tries >= needed:
                 break
             found.tries += 1
@@ -94,7 +94,7 @@ class Search:
             rows, y = self._agreeing(base, y)
             if len(rows) > len(best):
                 best, best_y, found.base = rows, y, base
-                share = len(best) / len(self.told)
+                share = len(best) / len(self.valid)
                 needed = math.log(1 - SURE) / math.log(1 - share) if share < 1 else 0.0
         if len(best) > 1:
             if len(best) > self.updates:
@@ -106,7 +106,7 @@ class Search:
         """Return the landmarks (n,) that are found where the match y (1, 2) of one predicts them, and their pixels."""
         prospect, prior = self.prospect, self.prospect.belief
         e = prospect.expected(prospect.moved(prior, [base], y))[:, :PIXEL]
-        others = self.told[self.told != base]
+        others = self.valid[self.valid != base]
         at, scores = self.searcher.in_discs(others, e[others], AGREE * self.sigma[others])
         good = np.flatnonzero(scores >= self.searcher.accept)
         fits = good[self._d2(prior, others[good], at[good]) <= GATE]
@@ -144,7 +144,7 @@ class Search:
     def _pending(self) -> tuple[Index, Array]:
         """Return the landmarks yet to be searched, the largest ellipses first, and their mean radii in px."""
         found = self.found
-        left = self.told[~found.searched[self.told]]
+        left = self.valid[~found.searched[self.valid]]
         Z = self.prospect.innovations(found.belief, left)
         radii = math.sqrt(GATE) * np.maximum(np.linalg.det(Z), 0.0) ** 0.25
         order = np.argsort(-radii, kind="stable")[: max(self.updates - int(found.matched.sum()), 0)]

@@ -307,7 +307,7 @@ def test_a_robot_that_stands_still_learns_nothing_of_its_heading_in_a_compressed
 
 
 def without(event: Any, left_out: set[Any]) -> Any:
-    """Return an event without the sightings of some landmarks."""
+    """Return an event without the observations of some landmarks."""
     if isinstance(event, km.Control):
         return event
     kept = [k for k, i in enumerate(event.ids) if i not in left_out]

@@ -1,4 +1,4 @@
-"""The drift of inactive blocks from where their error coordinates were left, estimated from the active ones.
+"""Change of inactive blocks since the last full update, estimated from the active blocks.
 
 An inactive block moves with the blocks that have entered the active map, and with where the robots were at the last
 full update: its correction is a regression on theirs.  Theirs is compared with the sigmas they have now, or, if they

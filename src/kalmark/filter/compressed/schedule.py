@@ -24,7 +24,7 @@ class Schedule:
     def begin(self, rows: int, observed: int) -> None:
         """Take note of the rows of the active map at its first correction, of which so many are observed.
 
-        What is more than `NEEDED` times these are blocks that were added before it.
+        Rows beyond `NEEDED` times these are of blocks that were added before it.
         """
         self.begun = min(rows, NEEDED * observed)
 
