@@ -69,7 +69,7 @@ plt.show()
 # Try changing
 # ------------
 #
-# ``factor=0.2``: the filter trusts its sensors too much, NIS and NEES grow.
+# ``factor=0.2``: the stated noise is too small, NIS and NEES grow.
 #
 # Another equation: copy the file of ``km.textbook``, change a line of ``TextbookSlam``, and name the class of the copy,
 # ``estimator: mine:Textbook`` with ``plugins: [mine.py]`` (docs/textbook.md).

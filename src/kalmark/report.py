@@ -31,7 +31,7 @@ NOTHING.flags.writeable = False
 
 
 class Observation(NamedTuple):
-    """One observation's fate: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance.
+    """Result of an observation: `outcome` one of `OUTCOMES`, `landmark` its id in the map, `d2` its squared distance.
 
     `shares` are the landmarks over which a soft association averaged, each with its weight, the likeliest first.
 

@@ -60,7 +60,7 @@ plt.show()
 #
 # The band is two sigmas of the first run, the dashed line the truth; the title gives the share of the runs that end
 # within three sigmas. The filter of :math:`\rho` is right at all three distances. The filter of :math:`d` is right
-# only at 10 m, where its prior happens to be centred; at 40 m it is sure of a wrong distance.
+# only at 10 m, where its prior happens to be centred; at 40 m it has a small sigma of a wrong distance.
 #
 # Try changing
 # ------------

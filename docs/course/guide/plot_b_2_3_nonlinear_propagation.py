@@ -51,7 +51,7 @@ plt.show()
 # ------------
 #
 # At 2 degrees both ellipses are one. At 45 degrees the first-order mean lies on the arc, the true mean behind it, and
-# the first-order ellipse claims a range that is known to 0.1 m on a straight line: it is too sure. Such errors are
+# the first-order ellipse claims a range that is known to 0.1 m on a straight line: it is overconfident. Such errors are
 # one reason for the inconsistency of EKF-SLAM.
 
 # %%

@@ -120,7 +120,7 @@ def landmark_markers(kept: MapSnapshot) -> list[MessageFields]:
 
 
 def status(run: Run, robot: str, step: int, P: Array) -> MessageFields:
-    """Return the fields of a DiagnosticStatus: how many observations became what, and how sure the pose is."""
+    """Return the fields of a DiagnosticStatus: numbers of observations by outcome, and the uncertainty of the pose."""
     history = run.history
     first, last = np.searchsorted(history.step, [step, step + 1])
     outcomes, counts = np.unique(history.outcome[first:last], return_counts=True)

@@ -63,7 +63,7 @@ LEAST = np.diag(np.square([1e-3, 1e-3, 1e-3]))  # m, m, rad: no path is followed
 
 
 class Steer(NamedTuple):
-    """A control of the log, where the robot was `dt_s` later, (3,), and how sure that is, (3, 3)."""
+    """A control of the log, the pose of the robot `dt_s` later, (3,), and its covariance (3, 3)."""
 
     event: Control
     dt_s: float = 0.0

@@ -66,7 +66,7 @@ class Judged(NamedTuple):
 
 
 class Uncertain(NamedTuple):
-    """A mount that calibrates itself: whose, its true pose (3,) or (7,), and which errors (3|6,) are not 0 for sure."""
+    """A mount that calibrates itself: whose, its true pose (3,) or (7,), and which errors (3|6,) may differ from 0."""
 
     carrier: str
     truth: Array

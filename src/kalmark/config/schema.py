@@ -66,7 +66,7 @@ class _Place(Section):
 
 
 class PlanePose(_Place):
-    """A pose in the plane, and how sure it is."""
+    """A pose in the plane, and its uncertainty."""
 
     theta_rad: Number = 0.0
     """Turned to the left, from x."""
@@ -77,7 +77,7 @@ class PlanePose(_Place):
 
 
 class SpacePose(_Place):
-    """A pose in space, and how sure it is; turned by roll, then pitch, then yaw about the fixed axes."""
+    """A pose in space, and its uncertainty; turned by roll, then pitch, then yaw about the fixed axes."""
 
     elsewhere: ClassVar[dict[str, str]] = dict.fromkeys(POSE_OF_PLANE, _PLANE_FOR_SPACE)
 

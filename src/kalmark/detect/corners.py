@@ -21,7 +21,7 @@ from kalmark.geometry.gaussian import gate
 STEPS = 10
 CORE = 8  # the part of a piece, at each end, that does not determine its line
 NEAR2 = 16.0  # a beam within 4 sigma of a line is on it
-TRIM = 2  # beams at the ends of a wall that are left out of the fit: which of two walls they hit is not sure
+TRIM = 2  # beams at the ends of a wall that are left out of the fit: they may be of either of two walls
 PROBABILITY = 0.9999  # with which a straight wall passes for one
 
 

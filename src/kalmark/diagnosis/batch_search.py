@@ -69,8 +69,8 @@ def search_causes(run: Run, log: Log, most: int, limit: int, progress: bool) -> 
 def associated(run: Run, log: Log) -> Run:
     """Return a run, or one of less certain controls if in that more observations are of landmarks, and fit better.
 
-    An error of the controls makes a filter that is too sure of them take landmarks for new ones, and leave others out:
-    then nothing of it is left in the residuals.  The batch problem has the noise that is stated.
+    An error of the controls, which are stated too exact, makes a filter take landmarks for new ones, and leave others
+    out: then nothing of it is left in the residuals.  The batch problem has the noise that is stated.
     """
     robots, before = run.final_slam().robots, fit_of_run(run)
     if not run.config.get("robots"):

@@ -17,7 +17,7 @@ from kalmark.diagnosis.onsets import find_onsets
 from kalmark.logs.progress import track
 
 ALPHA = 0.01  # of runs in which nothing is wrong have a finding of the search
-ROUNDS, MORE = 6, 14  # in which all that is sure is taken out, and further ones for what explains this
+ROUNDS, MORE = 6, 14  # in which all that is certain is taken out, and further ones for what explains this
 SHARE = (
     0.01  # of all that was explained: a log with many causes comes back to some of them, and more rounds are used up
 )

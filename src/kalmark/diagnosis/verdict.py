@@ -245,7 +245,7 @@ def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> 
 
 
 def _suspects(search: Search | None, most: int) -> list[Finding]:
-    """Return the likeliest errors of a search that are tried: so many that are sure, and one that may explain more."""
+    """Return the likeliest errors of a search that are tried: those that are certain, and one that may explain more."""
     sure = _steady(search)[:most]
     may_be = search.suspects[:1] if search else []
     return sure + [f for f in may_be if all(f.gain > one.gain for one in sure)]
@@ -370,7 +370,7 @@ def _found(run: Run, log: Log, first: list[Cause], found: Searched, effect: Effe
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     if found.given.segments is not None and not any(cause.name in JUMPS for cause in causes):
         causes += odd_controls(run, log)
-    if not any(cause.name == COPIES for cause in first):  # then the filter is too sure for that
+    if not any(cause.name == COPIES for cause in first):  # then that makes the filter overconfident
         causes += _too_sure(run, effect)
     return sorted(causes, key=lambda cause: -cause.score)
 
@@ -394,7 +394,7 @@ def begin_s(run: Run) -> float:
 def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None = None) -> list[Cause]:
     """Return the causes that a search found; a landmark that moves by less than the map's accuracy does not matter.
 
-    A noise that is stated too large has no cure where its errors last: with it the filter would be too sure.
+    A noise that is stated too large has no cure where its errors last: with it the filter would be overconfident.
     """
     again = restarts(run.history)  # their starts were made uncertain for the batch solution
     matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
@@ -566,7 +566,7 @@ def fits_nothing(run: Run) -> Iterator[Cause]:
 def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]:
     """Return the faults of sensors of the state, those that still do not fit, and whether that explains the run.
 
-    They are further off than their noise and that of the pose allow.  More noise explains nothing for sure.
+    They are further off than their noise and that of the pose allow.  More noise explains nothing with certainty.
     """
     now = fit_of_readings(run)
     if not now.off() and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL):
@@ -803,7 +803,7 @@ def effect_of(run: Run, found: Searched) -> Effect:
     if not free.any():
         return Effect(shift_m=shift_m, robots=robots)
     status = _status(shift_m, extent, float(np.median(filtered[free])))
-    shift_m = max(shift_m, by_steady)  # of causes that are sure, which no noise explains: reported, but no alarm
+    shift_m = max(shift_m, by_steady)  # of causes that are certain, which no noise explains: reported, but no alarm
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     same_data = not waited and not filter_only_sensors(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data

@@ -31,7 +31,7 @@ from kalmark.tracks.clones import Measurement
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
 
-VAGUE = 0.5  # a place less sure than this part of its distance is no Gaussian: not compared with anything
+VAGUE = 0.5  # a place less certain than this part of its distance is no Gaussian: not compared with anything
 FITS = 0.999  # probability with which the measurements of a true landmark agree
 
 

@@ -2,7 +2,7 @@
 
 Each hypothesis is a block of the map: the place of the sensor, the direction from there, the distance.  Until one
 position is left none of them corrects anything else: a range corrects each hypothesis as if it were true (Schmidt's
-filter), since to correct the pose by all of them would count the range several times, and by a wrong one would spoil
+filter), since to correct the pose by all of them would count the range several times, and by a wrong one would falsify
 it.
 
     F = 1 - K H on the hypothesis' rows,   Q = K (R + C) K',   C = (h'' P)^2 / 2

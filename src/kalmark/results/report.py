@@ -412,7 +412,7 @@ def _association(run: Recording, t: Array, world: bool) -> Data:
 
 
 def ambiguous(history: History) -> Ints:
-    """Return the steps of the most ambiguous scans, in the order of time: those with most observations in doubt."""
+    """Return the steps of the most ambiguous scans, in the order of time: those with most ambiguous observations."""
     if not len(history.candidate_row):
         return np.zeros(0, dtype=np.int64)
     doubt = (history.outcome == "deferred").astype(np.int64)

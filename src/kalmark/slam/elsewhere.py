@@ -37,7 +37,7 @@ from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.surveys import SURVEYED
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
-WIDER = 3.0  # times its sigmas by which a filter that is too sure may be off
+WIDER = 3.0  # times its sigmas by which an overconfident filter may be off
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
 HELD = 2  # scans of several landmarks that are held back without an alternative
 MOST = 48  # landmarks of a constellation
@@ -56,7 +56,7 @@ def concerns(scan: ScanContext) -> bool:
 def limit_of(state: State, scan: ScanContext) -> float:
     """Return the d2 up to which an observation with an id is not far off; infinite where the gate is switched off.
 
-    A filter that is too sure may be off by `WIDER` times its sigmas.
+    An overconfident filter may be off by `WIDER` times its sigmas.
     """
     is_off = state.policies[scan.key].association.threshold(1, 0.0) == math.inf
     if scan.event.ids is None or is_off or not concerns(scan):

@@ -160,7 +160,7 @@ def correct_by_factor(state: State, factor: Factor, share: float) -> Observation
         raise EventError(f"{factor.what}: all of these are known exactly, expected one that is estimated")
     factor.linearize(blocks, [block.mean for block in blocks])  # what is wrong with it shows before anything moves
     if robots and state.t_ns is not None:
-        moves.advance(state, *robots)  # a gap that it notices goes on: the robot's next report has it
+        moves.advance(state, *robots)  # a gap that is found here goes on: the robot's next report has it
         blocks = _blocks(state.map, state.tracks, names)
     d2, start = factor.as_block(blocks, state.map.covariance([block.slot for block in blocks if block.dof]))
     limit = gate_of(share, len(factor.y))

@@ -159,7 +159,7 @@ def compare_alternatives(state: State, scan: ScanContext, judged: Sequence[Judge
 
 
 def can_be_summed(channel: Channel) -> bool:
-    """Return whether what a sensor observes corrects a Gaussian sum where no linearisation bears it."""
+    """Return whether what a sensor observes corrects a Gaussian sum where no linearisation holds."""
     return channel.dimensions == 2 and not channel.gives_places and not channel.sees_velocity
 
 

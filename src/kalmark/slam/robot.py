@@ -68,7 +68,7 @@ class Mount:
 
     `landmark` is the type of landmark this sensor starts and `association` its own, if not the slam's.  `detector`
     turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
-    and unmakes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
+    and removes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
     by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
     called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas, and `lag_s`,
     the time by which the stamps of its scans are late, if that has (docs/race_track.md).  `robust` makes outliers count

@@ -1,4 +1,4 @@
-"""The depth of pixels beside an image (RGB-D): what a measurement (u, v, 1 / z) has of it, and how sure it is.
+"""The depth of pixels beside an image (RGB-D): what a measurement (u, v, 1 / z) has of it, and its uncertainty.
 
 At the edge of a thing the depth image jumps, and the pixel may belong to either side.  So the depth counts where all
 around the pixel agree within `EDGE` sigmas, and where it is within the gate of what the filter expects.  Elsewhere the

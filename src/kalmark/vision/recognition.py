@@ -42,7 +42,7 @@ class Recognised(NamedTuple):
 def match_expected(
     cv2: Any, image: Any, views: Sequence[Sequence[View]], old: Index, prospect: Prospect, searcher: Searcher
 ) -> tuple[Index, Array] | None:
-    """Return landmarks (n,) of a prospect and the pixels (n, 2) where an image shows them; None if that is not sure.
+    """Return landmarks (n,) of a prospect and the pixels (n, 2) where an image shows them; None if that is ambiguous.
 
     `old` (k,) are the landmarks of these views.
     """
@@ -59,7 +59,7 @@ def match_expected(
 def recognize_place(
     cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any
 ) -> Recognised | None:
-    """Return the pose from which an image (H, W) of landmarks at `places` (K, 3) was taken; None if it is not sure."""
+    """Return the pose from which an image (H, W) of landmarks at `places` (K, 3) was taken; None if it is ambiguous."""
     orb = cv2.ORB_create(CORNERS, nlevels=1, edgeThreshold=REACH + 1, patchSize=2 * REACH + 1)
     known, owner = describe_views(cv2, orb, views)
     seen, y = describe_corners(cv2, orb, image)

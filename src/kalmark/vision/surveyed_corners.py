@@ -39,7 +39,7 @@ class FirstLook:
             self.corners = fine[np.abs(fine - at).max(axis=1) < APART]
 
     def found(self, belief: Belief, rows: list[int]) -> dict[int, Array]:
-        """Return the pixels (2,) of landmarks by their rows; none if they are not sure."""
+        """Return the pixels (2,) of landmarks by their rows; none if they are ambiguous."""
         Z = self.prospect.innovations(belief, np.array(rows, dtype=np.int64))
         order = [rows[k] for k in np.argsort(np.linalg.det(Z), kind="stable")[:AT_ONCE].tolist()]
         trials = []
