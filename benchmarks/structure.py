@@ -167,8 +167,9 @@ def prose() -> Iterator[str]:
 
 
 def figures_of_speech(text: str) -> list[str]:
-    """Return the words of a text that make a person of a thing or that the glossary replaces, and subjects "What"."""
-    return [*(match[0] for match in FIGURATIVE.finditer(text)), *SUBJECTS.findall(text)]
+    """Return the places of a text with words that the glossary replaces, or that begin a sentence with `What`."""
+    found = (match for words in (FIGURATIVE, SUBJECTS) for match in words.finditer(text))
+    return [text[max(match.start() - 40, 0) : match.end() + 40] for match in found]
 
 
 def branches(node: ast.AST) -> int:
