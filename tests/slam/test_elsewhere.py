@@ -105,7 +105,7 @@ def test_a_robot_that_is_carried_away_is_found(ids: bool, surveyed: str, seed: i
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_robot_is_found_by_a_sensor_whose_limits_are_not_stated(seed: int) -> None:
     """Its range is counted from its observations; landmarks beyond it contradict no pose."""
-    places, events, poses = carried_log(seed, ids=False)
+    _, events, poses = carried_log(seed, ids=False)
     off, carried = errors(slam_at(path(1)[0], ids=False, limits={}), events, poses)
     assert [gap.robot for gap in carried] == ["rover"]
     assert off[-300:].max() < 0.8

@@ -1,4 +1,4 @@
-"""Observations of tentative landmarks are kept with their poses, and fused when the landmark is confirmed."""
+"""Confirmation: observations of tentative landmarks are kept with their poses, and fused when one is confirmed."""
 
 from __future__ import annotations
 

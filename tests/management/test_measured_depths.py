@@ -1,4 +1,4 @@
-"""Landmarks of unknown depth whose distance another sensor tells."""
+"""Landmarks of unknown depth whose distance another sensor determines."""
 
 from __future__ import annotations
 

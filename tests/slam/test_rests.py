@@ -1,4 +1,4 @@
-"""Robots that stand: how often that is noticed, how seldom in error, and what it does to pose and covariance."""
+"""Robots that stand: rates of detection and of false alarms, and the effect on pose and covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scans whose observations can each be of one landmark only: answered at once, and as by all questions."""
+"""Scans whose observations have one candidate each: the associations are those of the general way."""
 
 from __future__ import annotations
 

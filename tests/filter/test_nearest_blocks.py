@@ -1,4 +1,4 @@
-"""Which landmarks are near a place: the same, wherever the map keeps them."""
+"""Landmarks near a place: the same, wherever the map keeps them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What turns in a correction, and with which rotation: units that others see, lever arms beside landmarks."""
+"""Blocks that turn in a correction, and their rotation: units that others observe, lever arms beside landmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the order of observations tells: a robot that was carried away, and one thing that is in the map twice."""
+"""Faults that the order of observations shows: a robot that was carried away, a thing that is in the map twice."""
 
 from __future__ import annotations
 
