@@ -27,7 +27,7 @@ import numpy as np
 from kalmark.bags.first_config import first_config
 from kalmark.bags.run_messages import export
 from kalmark.bags.survey import survey
-from kalmark.bags.tagslam import SIGMA, Scene, frame_of, read_cameras, read_scene
+from kalmark.bags.tagslam import SIGMA, TagSetup, frame_of, read_cameras, read_scene
 from kalmark.config import build_slam, open_run
 from kalmark.events import Scan, fixed_seconds
 from kalmark.geometry.frames3d import compose, inverse
@@ -117,7 +117,7 @@ def edited(lines: list[str], where: Path, own: Log) -> list[str]:
     return [line.replace(moved, f"{moved}, {noise}") for line in out]
 
 
-def odometry_noise(scene: Scene, scans: list[Scan]) -> str:
+def odometry_noise(scene: TagSetup, scans: list[Scan]) -> str:
     """Return the noise of the odometry's increments: that of TagSLAM's file over the usual interval of the scans."""
     share = np.sqrt(np.median(np.diff([scan.t_ns for scan in scans])) * 1e-9)
     body: dict[str, Any] = next(iter(scene.odometry.values()), {})

@@ -11,7 +11,7 @@ import pytest
 
 import kalmark as km
 from kalmark.campaign import Replay, open_scene, run_campaign
-from kalmark.campaign.replay import LEAST, Look, Steer, steer_to_path
+from kalmark.campaign.replay import LEAST, ReplayedScan, Steer, steer_to_path
 from kalmark.campaign.scoring import SERIES
 from kalmark.cli import main
 from kalmark.cli.logs import fitting_config
@@ -88,7 +88,7 @@ def test_a_replay_keeps_to_the_logs_route_and_looks_at_what_the_log_looked_at(sc
              for e in scene.recorded.events if isinstance(e, Steer) and e.dt_s}  # fmt: skip
     away = [np.linalg.norm(truth.at(t)[:2] - goal.goal[:2]) for t, goal in goals.items() if t in truth.t_ns]
     assert len(away) > 100 and np.median(away) < 0.1 and max(away) < 0.4
-    looks = [e for e in scene.recorded.events if isinstance(e, Look)]
+    looks = [e for e in scene.recorded.events if isinstance(e, ReplayedScan)]
     scans = [e for e in simulated.log.events if isinstance(e, km.Scan)]
     assert [scan.t_ns for scan in scans] == [look.event.t_ns for look in looks] == [*scene.times()]
     assert [scan.ids for scan in scans] == [look.event.ids for look in looks]

@@ -23,7 +23,7 @@ import kalmark as km
 from command_line import Kalmark
 from kalmark.cli.live import Checkpoints, Signals, serve
 from kalmark.logs.json_lines import KEYS, LONGEST_LINE, event_of_object, line_of_event, mapping_of
-from kalmark.results.live import Incoming, Live, converse
+from kalmark.results.live import LineStream, Live, converse
 
 CONFIG = """robots:
   rover:
@@ -245,7 +245,7 @@ def test_an_event_that_is_sent_again_after_a_restart_is_not_taken_twice(tmp_path
 
 def test_lines_come_out_of_pieces_whole_and_long_ones_cut(tmp_path: Path) -> None:
     here, there = os.pipe()
-    incoming = Incoming(here)
+    incoming = LineStream(here)
     os.write(there, b"one\ntw")
     assert incoming.readline(10) == "one\n"
     os.write(there, b"o\n" + b"x" * 25 + b"\n\xff")

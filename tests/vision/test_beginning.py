@@ -9,7 +9,7 @@ import kalmark as km
 from kalmark.codec import Reader, Writer, kind_of
 from kalmark.errors import KalmarkError
 from kalmark.geometry.frames3d import from_euler_pose, to_frame_many
-from kalmark.slam.sources import Replay
+from kalmark.slam.sources import BufferedScans
 from kalmark.vision.beginning import LEAST_RHO, Beginning, residuals
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
@@ -27,7 +27,9 @@ def sideways(frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndar
     return np.array([from_euler_pose(pose)[0] for pose in poses]), points
 
 
-def tried(poses: np.ndarray, points: np.ndarray, estimated: np.ndarray, rng: np.random.Generator) -> Replay | None:
+def tried(
+    poses: np.ndarray, points: np.ndarray, estimated: np.ndarray, rng: np.random.Generator
+) -> BufferedScans | None:
     """Return how a map begins whose filter has `estimated` (F, 7), of pixels with a noise of a fifth."""
     beginning = Beginning()
     for k, (T, wrong) in enumerate(zip(poses, estimated, strict=True)):

@@ -17,7 +17,7 @@ from kalmark.vision.joint_expectation import Prospect
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane as Surroundings
 from kalmark.vision.rendering import Rectangle, Renderer, texture
-from kalmark.vision.selection import Search
+from kalmark.vision.selection import ImageSearch
 from kalmark.vision.template_matching import Searcher, correlation
 
 cv2 = pytest.importorskip("cv2", reason="needs OpenCV: pip install 'kalmark[opencv]'")
@@ -147,7 +147,7 @@ def test_one_point_ransac_rejects_planted_outliers_and_keeps_the_rest(seed: int)
     out = rng.permutation(20)[:6].tolist()
     angles = np.pi / 3 * np.arange(6)
     wrong = {k: true[k] + 5 * np.array([np.cos(a), np.sin(a)]) for k, a in zip(out, angles, strict=True)}
-    found = Search(prospect, np.arange(20), Planted(true, wrong), 100).run(rng)
+    found = ImageSearch(prospect, np.arange(20), Planted(true, wrong), 100).run(rng)
     assert sorted(np.flatnonzero(~found.matched).tolist()) == sorted(out)
 
 

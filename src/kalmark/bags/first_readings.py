@@ -11,7 +11,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.bags.configured_topics import sensor_name
 from kalmark.bags.first_sensors import mount_of
-from kalmark.bags.first_start import Start
+from kalmark.bags.first_start import EstimatedStart
 from kalmark.bags.first_words import GUESS, Entry, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.inertial_messages import heading_of, heading_of_field
 from kalmark.bags.messages import Measured
@@ -48,7 +48,9 @@ def up_direction(topic: TopicSummary) -> Array | None:
 class Readings:
     """Decides which readings of inertial units and compasses are taken, for one robot, and how good they may be."""
 
-    def __init__(self, found: Survey, control: Any, kind: str, space: bool, start: Start | None, ahead: float) -> None:
+    def __init__(
+        self, found: Survey, control: Any, kind: str, space: bool, start: EstimatedStart | None, ahead: float
+    ) -> None:
         self.found, self.control, self.kind, self.begin, self.ahead = found, control, kind, start, ahead
         self.space = space
         self.sensors: list[str] = []

@@ -21,7 +21,7 @@ POSE_M, POSE_RAD = 0.5, 0.2  # sigmas of positions and headings that come withou
 
 
 @dataclass
-class Start:
+class EstimatedStart:
     """Start of a robot: x, y, heading, their two sigmas, and the source.
 
     `north`: the map's axes are east and north; `known`: the heading has a source.
@@ -34,7 +34,7 @@ class Start:
     known: bool = True
 
 
-def start_of(found: Survey, control: Any, used: Mapping[str, Entry], space: bool) -> Start | None:
+def start_of(found: Survey, control: Any, used: Mapping[str, Entry], space: bool) -> EstimatedStart | None:
     """Return a robot's start in the frame of its fixes, None if nothing or a true path in that frame determines it."""
     if control is None or space:
         return None
@@ -49,10 +49,10 @@ def start_of(found: Survey, control: Any, used: Mapping[str, Entry], space: bool
         sigmas = [math.sqrt(max(cov[0, 0], cov[1, 1], 1e-4)), math.sqrt(max(cov[5, 5], 1e-4))]
         first = fix.poses.frames[0]
         at = [float(first[0]), float(first[1]), yaw(first)]
-        return Start(at, sigmas, f"{GUESS} the first pose of {fix.name}")
+        return EstimatedStart(at, sigmas, f"{GUESS} the first pose of {fix.name}")
     if (laid := align_odometry(poses, fix)) is not None:
-        return Start(*laid, f"{GUESS} the way by odometry laid upon that by {fix.name}", north=True)
-    return Start([0.0] * 3, [5.0, 1.5], f"{GUESS} its heading, from east to the left", north=True, known=False)
+        return EstimatedStart(*laid, f"{GUESS} the way by odometry laid upon that by {fix.name}", north=True)
+    return EstimatedStart([0.0] * 3, [5.0, 1.5], f"{GUESS} its heading, from east to the left", north=True, known=False)
 
 
 def align_odometry(odometry: Poses, fixes: TopicSummary) -> tuple[list[float], list[float]] | None:

@@ -21,7 +21,7 @@ from kalmark.bags.messages import (
     Seen,
 )
 from kalmark.bags.opening import Bag, Received, find_bag, has_header, header_time, refuse_undeclared_fields
-from kalmark.bags.state_topics import Gathered, Incoming, OwnReadings
+from kalmark.bags.state_topics import Gathered, OwnReadings, TopicMessage
 from kalmark.bags.tf_mounts import Mounts
 from kalmark.bags.topics import (
     Fixes,
@@ -147,11 +147,11 @@ class _Importer:
             return
         try:
             with refuse_undeclared_fields():
-                self.taken(Incoming(name, self.topics[name], self.asked.offers[name], received.message, t_ns))
+                self.taken(TopicMessage(name, self.topics[name], self.asked.offers[name], received.message, t_ns))
         except (Refused, EventError) as refused:
             self.request.refuse(f"{self.bag.path}: {name} at t={fixed_seconds(t_ns)} s: {refused}")
 
-    def taken(self, m: Incoming) -> None:
+    def taken(self, m: TopicMessage) -> None:
         """Take the parts of a message that its topic is configured for.  Raises Refused and EventError."""
         topic, offer = m.topic, m.offer
         if isinstance(topic, Scans):
@@ -193,7 +193,7 @@ class _Importer:
             raise LogError(f"{self.bag.path}: {what}, expected one clock: `time: recorded` for both")
         return t_ns + round(topic.shift_s * 1e9)
 
-    def poses(self, m: Incoming, topic: Posed) -> None:
+    def poses(self, m: TopicMessage, topic: Posed) -> None:
         """Take the pose in a message, or those of its frames that the topic asks for, each at its own time."""
         if m.offer.transforms is not None:
             wanted = ((topic.frame or "").lstrip("/"), (topic.child_frame or "").lstrip("/"))
@@ -205,7 +205,7 @@ class _Importer:
         elif m.offer.pose is not None:
             self.pose(m, m.offer.pose(m.message))
 
-    def pose(self, m: Incoming, pose: Measured) -> None:
+    def pose(self, m: TopicMessage, pose: Measured) -> None:
         """Take one pose: of odometry, as a fix or as truth."""
         if not np.isfinite(pose.v[:3]).all():
             raise Refused(f"pose {pose.v.tolist()}, expected finite numbers")
@@ -219,7 +219,7 @@ class _Importer:
         else:
             self.add_odometry_pose(m, pose.v)
 
-    def add_odometry_pose(self, m: Incoming, frame: Array) -> None:
+    def add_odometry_pose(self, m: TopicMessage, frame: Array) -> None:
         """Take a pose (7,) of odometry: the increment from the one before it."""
         topic, before = m.topic, self.last.get(m.name)
         if not self.out.is_next(m, before and before[0], "poses"):
@@ -255,7 +255,7 @@ class _Importer:
             for t, (a, b) in zip(t_ns[1:], pairwise(path.at(t_ns, max_gap_s=FOREVER_S)), strict=True):
                 self.out.events.append(Control(t_ns=t, robot=topic.robot, u=self.step(topic, a, b)))
 
-    def control(self, m: Incoming, u: Array, cov: Array | None) -> None:
+    def control(self, m: TopicMessage, u: Array, cov: Array | None) -> None:
         """Take a control."""
         if cov is not None:
             if not np.isfinite(cov).all():
@@ -264,7 +264,7 @@ class _Importer:
                 raise Refused(f"noise {cov.tolist()}, expected it positive semidefinite")
         self.out.events.append(Control(t_ns=m.t_ns, robot=m.topic.robot, u=u, cov=cov))
 
-    def globe(self, m: Incoming, topic: Placed, place: Measured | None) -> None:
+    def globe(self, m: TopicMessage, topic: Placed, place: Measured | None) -> None:
         """Take a position on the globe: as a fix, or to score only."""
         if place is None:
             self.out.left_out[m.name, "messages without a fix"] += 1
@@ -279,7 +279,7 @@ class _Importer:
         else:
             self.kept(self.positions, m, enu[:2])
 
-    def fix(self, m: Incoming, topic: Fixes, p: Array, cov: Array | None) -> None:
+    def fix(self, m: TopicMessage, topic: Fixes, p: Array, cov: Array | None) -> None:
         """Take a position as a fix, with the noise of the topic or else its own."""
         own = _AXES3 if self.in_space(topic.robot) else _AXES2
         N = None if cov is None else cov[np.ix_(own, own)]
@@ -290,13 +290,13 @@ class _Importer:
             raise Refused(f"the position has {told}, expected a positive definite one, or sigma_m of the topic")
         self.out.events.append(Fix(t_ns=m.t_ns, robot=topic.robot, y=p[own], cov=N))
 
-    def kept(self, table: dict[str, dict[int, Array]], m: Incoming, value: Array) -> None:
+    def kept(self, table: dict[str, dict[int, Array]], m: TopicMessage, value: Array) -> None:
         """Keep a true pose or position; times must increase."""
         mine = table.setdefault(m.topic.robot, {})
         if self.out.is_next(m, next(reversed(mine), None), "poses"):
             mine[m.t_ns] = value
 
-    def scan(self, m: Incoming, topic: Scans) -> None:
+    def scan(self, m: TopicMessage, topic: Scans) -> None:
         """Take what a sensor saw."""
         seen = m.offer.seen(m.message, topic)  # type: ignore[misc]
         seen = seen.without([topic.ignores(id_, m.t_ns) for id_ in seen.ids])
@@ -309,7 +309,7 @@ class _Importer:
             raise Refused(f"columns {', '.join(columns)}, expected {', '.join(known)} as in its first message")
         self.out.events.append(Scan(t_ns=m.t_ns, robot=topic.robot, sensor=sensor, y=y, ids=seen.ids or None))
 
-    def image(self, m: Incoming, topic: Images) -> None:
+    def image(self, m: TopicMessage, topic: Images) -> None:
         """Take an image, whose pixels are read from the bag when they are needed."""
         if m.name not in self.images:
             self.images[m.name] = Forward(partial(images_of, self.bag.path, self.named[m.name]))
@@ -355,7 +355,7 @@ class _Importer:
         return wanted, turned_at_all(wanted, np.column_stack([given[column] for column in wanted]))
 
 
-def own_noise(m: Incoming, rows: list[int]) -> Array | None:
+def own_noise(m: TopicMessage, rows: list[int]) -> Array | None:
     """Return the covariance of some numbers of a message's twist, if controls take it.  Raises Refused."""
     if not isinstance(m.topic, Noisy) or not m.topic.own_noise:
         return None

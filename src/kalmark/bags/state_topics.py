@@ -20,7 +20,7 @@ from kalmark.logs.log import Names, SensorKey
 from kalmark.logs.table import Refused
 
 
-class Incoming(NamedTuple):
+class TopicMessage(NamedTuple):
     """One message at its time, by the name of the entry of the configuration that asks for it."""
 
     name: str
@@ -38,7 +38,7 @@ class Gathered:
     sensor_columns: dict[SensorKey, Names] = field(default_factory=dict)
     left_out: Counter[tuple[str, str]] = field(default_factory=Counter)
 
-    def is_next(self, m: Incoming, before_ns: int | None, what: str) -> bool:
+    def is_next(self, m: TopicMessage, before_ns: int | None, what: str) -> bool:
         """Return whether a time follows the one before; one that is the same is counted.  Raises Refused."""
         if before_ns is None or m.t_ns > before_ns:
             return True
@@ -59,7 +59,7 @@ class OwnReadings:
         self.rates: dict[SensorKey, dict[int, Array]] = {}
         self.read_ns: dict[SensorKey, int] = {}
 
-    def take(self, m: Incoming, topic: Sparse) -> None:
+    def take(self, m: TopicMessage, topic: Sparse) -> None:
         """Take what an inertial unit or a compass measured of its robot, of what is sparse only now and then."""
         for sensor, columns, y in self.said(m, topic):
             key, often = (topic.robot, sensor), columns in GYRO.values()
@@ -68,7 +68,7 @@ class OwnReadings:
             elif often or key not in self.read_ns or m.t_ns - self.read_ns[key] >= topic.every_s * 1e9:
                 self.reading(m, sensor, columns, y)
 
-    def said(self, m: Incoming, topic: Sparse) -> Iterator[tuple[str, Names, Any]]:
+    def said(self, m: TopicMessage, topic: Sparse) -> Iterator[tuple[str, Names, Any]]:
         """Yield the readings of a message, in the plane made level: sensor, columns and numbers."""
         R = self.level.get(m.name, (np.eye(3), False))[0]
         if isinstance(topic, Compass) and (b := self.measured(m, "field", m.offer.field)) is not None:
@@ -90,7 +90,7 @@ class OwnReadings:
         if topic.gravity and (a := self.measured(m, "accelerations", m.offer.force)) is not None:
             yield topic.gravity, GRAVITY, a
 
-    def measured(self, m: Incoming, what: str, read: Reads) -> Array | None:
+    def measured(self, m: TopicMessage, what: str, read: Reads) -> Array | None:
         """Return the measurement that is read from a message; without one count it and return None."""
         found = None if read is None else read(m.message)
         if found is None:
@@ -100,7 +100,7 @@ class OwnReadings:
             raise Refused(f"{what} {found.v.tolist()}, expected finite numbers")
         return found.v
 
-    def reading(self, m: Incoming, sensor: str, columns: Names, y: Any) -> None:
+    def reading(self, m: TopicMessage, sensor: str, columns: Names, y: Any) -> None:
         """Take a reading of a sensor of the robot itself: one at a time."""
         robot, t_ns = m.topic.robot, m.t_ns
         if self.read_ns.get((robot, sensor)) == t_ns:
@@ -124,7 +124,7 @@ class OwnReadings:
             self.out.sensor_columns[robot, sensor] = GYRO[self.in_space(robot)]
             self.out.events += [Scan(t_ns=t, robot=robot, sensor=sensor, y=w[None]) for t, w in found]
 
-    def inertial(self, m: Incoming) -> None:
+    def inertial(self, m: TopicMessage) -> None:
         """Take rates and specific forces, held from now on; times must increase."""
         robot, w = m.topic.robot, self.measured(m, "rates", m.offer.rates)
         a = self.measured(m, "accelerations", m.offer.force)

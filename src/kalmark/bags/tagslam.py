@@ -59,7 +59,7 @@ def find(path: Path) -> Path | None:
 
 # ------------------------------------------------------------------ the scene
 @dataclass
-class Scene:
+class TagSetup:
     """Content of tagslam.yaml: sizes (m) of tags, that of all others (None: they are ignored), the names of bodies.
 
     `squashed` are (time in ns, tag) of detections to leave out, `hamming` the most corrected bits by body.
@@ -90,11 +90,11 @@ class Scene:
         return f"detections with more than {most} corrected bits" if tag.hamming > most else ""
 
 
-def read_scene(path: Path) -> Scene:
+def read_scene(path: Path) -> TagSetup:
     """Return the scene in tagslam.yaml.  Raises LogError if it does not have the form of TagSLAM."""
     content = read_mapping(path)
     try:
-        scene = Scene(default_body=content.get("default_body", ""))
+        scene = TagSetup(default_body=content.get("default_body", ""))
         scene.pixel_noise = float(content.get("tagslam_parameters", {}).get("pixel_noise", 1.0))
         for entry in content["bodies"]:
             for name, body in entry.items():
@@ -109,7 +109,7 @@ def read_scene(path: Path) -> Scene:
     return scene
 
 
-def add_body(scene: Scene, name: str, body: Section) -> None:
+def add_body(scene: TagSetup, name: str, body: Section) -> None:
     """Add one body: its own tags, those of its board, the size of all others if it is the default body."""
     scene.static[name] = bool(body["is_static"])
     if "max_hamming_distance" in body:
@@ -235,7 +235,7 @@ class Reference(NamedTuple):
     cameras: dict[str, Array]
 
 
-def read_reference(folder: Path, scene: Scene, rig: str) -> Reference:
+def read_reference(folder: Path, scene: TagSetup, rig: str) -> Reference:
     """Return the result in reference.bag, in the map's frame; that of the body with the tags if the rig stands still.
 
     Tags and cameras are taken from the last transforms in the bag.
@@ -281,7 +281,7 @@ class Odometry(NamedTuple):
     sigma_rad: float
 
 
-def read_odometry(scene: Scene, received: Messages) -> Odometry | None:
+def read_odometry(scene: TagSetup, received: Messages) -> Odometry | None:
     """Return the odometry of the rig, None if there is none in the bag."""
     for body in scene.odometry.values():
         rows = [(header_time(m), m.pose.pose) for topic, m in received if topic == body["odom_topic"]]
@@ -309,7 +309,7 @@ def rig_increments(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
 
 
 # ------------------------------------------------------------------ the log
-def scans_of(received: Messages, cameras: dict[str, str], scene: Scene, bag: Path, request: Request) -> list[Scan]:
+def scans_of(received: Messages, cameras: dict[str, str], scene: TagSetup, bag: Path, request: Request) -> list[Scan]:
     """Return the scans of the cameras, by topic, in order of time: corners in TagSLAM's order and the size of each tag.
 
     Frames that are left out are counted by their reason.

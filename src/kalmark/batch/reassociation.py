@@ -67,7 +67,7 @@ def reassociate(replay: BatchReplay, may_change: Flags, numbers: Iterable[int] =
     rounds, settled, iterations = 0, False, batch.iterations
     for _ in numbers:
         rounds += 1
-        look = _Look(replay, batch, may_change)
+        look = _Observations(replay, batch, may_change)
         decided = look.decided(names)
         places = look.unexplained(decided)
         for place, rows in places:
@@ -104,7 +104,7 @@ class _Seen(NamedTuple):
     covariance: Array
 
 
-class _Look:
+class _Observations:
     """The observations from the poses of a solution."""
 
     def __init__(self, replay: BatchReplay, batch: Batch, may_change: Flags) -> None:
@@ -219,7 +219,9 @@ def _seen(replay: BatchReplay, batch: Batch, key: tuple[str, str, int], may_chan
     return [_Seen(row, near, d2, places, L_y @ R @ L_y.swapaxes(1, 2))]
 
 
-def find_coincident(batch: Batch, names: Sequence[Id | None], look: _Look, new: Sequence[Id]) -> list[tuple[Id, Id]]:
+def find_coincident(
+    batch: Batch, names: Sequence[Id | None], look: _Observations, new: Sequence[Id]
+) -> list[tuple[Id, Id]]:
     """Return pairs of landmarks that are one; each landmark is in one pair at most.
 
     The first is the new one, or that of fewer observations.

@@ -17,7 +17,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from kalmark.campaign.replay import Look, Replay
+from kalmark.campaign.replay import Replay, ReplayedScan
 from kalmark.campaign.scoring import SERIES, Scores
 from kalmark.config.schema import Config
 from kalmark.errors import KalmarkError
@@ -45,7 +45,7 @@ def cell_digest(scene: World | Replay, configs: Mapping[str, Config]) -> str:
         digest.update(Path(plugin).read_bytes())
     if isinstance(scene, Replay):
         for look in scene.recorded.events:
-            if isinstance(look, Look):
+            if isinstance(look, ReplayedScan):
                 digest.update(f"{look.event.t_ns} {look.event.y.tolist()}".encode())
     return digest.hexdigest()[:16]
 

@@ -71,7 +71,7 @@ class Steer(NamedTuple):
     cov: Array = LEAST
 
 
-class Look(NamedTuple):
+class ReplayedScan(NamedTuple):
     """A scan of the log: rows of it, and the landmark of the map or the robot that each of these was of."""
 
     event: Scan
@@ -93,7 +93,7 @@ class Look(NamedTuple):
 class Recorded(NamedTuple):
     """Events to replay, in the order of the log, and the landmarks: (2,) m, or (3,) with a signature."""
 
-    events: list[Steer | Look | Fix]
+    events: list[Steer | ReplayedScan | Fix]
     landmarks: dict[Id, Array]
 
 
@@ -109,7 +109,7 @@ def record_for_replay(config: Config, log: Log, progress: bool = True) -> Record
     if len(sizes) > 1:
         raise KalmarkError(f"{log.name}: got points with and without a signature, expected one kind to replay")
     events = _recognised(reports, landmarks, (*slam.robots,) if sizes == {2} else ())
-    if not any(isinstance(event, Look) for event in events):
+    if not any(isinstance(event, ReplayedScan) for event in events):
         nameless = any(o.reason == NO_ID for report in reports for o in report.observations)
         hint = "; without ids try --set association.type=auto" if nameless else ""
         raise KalmarkError(f"{log.name}: no observation is of a landmark of the map, expected some to replay{hint}")
@@ -132,13 +132,15 @@ def _processed(slam: Slam, event: Event, config: Config) -> Report | None:
         raise KalmarkError(f"campaign: {error}, expected a filter that gets through its own log") from None
 
 
-def _recognised(reports: list[Report], landmarks: dict[Id, Array], robots: tuple[str, ...]) -> list[Event | Look]:
+def _recognised(
+    reports: list[Report], landmarks: dict[Id, Array], robots: tuple[str, ...]
+) -> list[Event | ReplayedScan]:
     """Return the events with scans as looks at the landmarks of the final map; each is looked at once in a scan."""
     merged: dict[Id, Id] = {}
     for report in reversed(reports):
         for gone, into, _ in report.merged:
             merged[gone] = merged.get(into, into)
-    events: list[Event | Look] = []
+    events: list[Event | ReplayedScan] = []
     for report in reports:
         if not isinstance(report.event, Scan):
             events.append(report.event)
@@ -149,7 +151,7 @@ def _recognised(reports: list[Report], landmarks: dict[Id, Array], robots: tuple
             if o.outcome != "rejected" and name != report.robot and (name in landmarks or name in robots):
                 rows.setdefault(name, o.index)
         if rows:
-            events.append(Look(report.event, tuple(rows.values()), tuple(rows)))
+            events.append(ReplayedScan(report.event, tuple(rows.values()), tuple(rows)))
     return events
 
 
@@ -168,16 +170,16 @@ def _on_known_map(config: Config) -> Config:
     return config.model_copy(update={"robots": robots, **given})
 
 
-def _followed(slam: Slam, events: Iterable[Event | Look], config: Config) -> list[Steer | Look | Fix]:
+def _followed(slam: Slam, events: Iterable[Event | ReplayedScan], config: Config) -> list[Steer | ReplayedScan | Fix]:
     """Return the events, each control with the pose at the end of its interval."""
-    followed: list[Steer | Look | Fix] = []
+    followed: list[Steer | ReplayedScan | Fix] = []
     acting: dict[str, tuple[int, Steer]] = {}  # by robot: which control is in force, or was the last increment
     for event in events:
-        raw = event.scan(event.event.y[list(event.rows)], event.real) if isinstance(event, Look) else event
+        raw = event.scan(event.event.y[list(event.rows)], event.real) if isinstance(event, ReplayedScan) else event
         if _processed(slam, raw, config) is None:
             continue
         if not isinstance(event, Control):
-            followed.append(cast("Look | Fix", event))
+            followed.append(cast("ReplayedScan | Fix", event))
             continue
         name = event.robot
         at, before = acting.get(name, (0, None))
@@ -218,7 +220,7 @@ class Replay:
 
     def times(self) -> tuple[int, ...]:
         """Return the times (ns) at which any robot scans."""
-        return tuple(sorted({e.event.t_ns for e in self.recorded.events if isinstance(e, Look)}))
+        return tuple(sorted({e.event.t_ns for e in self.recorded.events if isinstance(e, ReplayedScan)}))
 
     def to_yaml(self) -> str:
         """Return the text of the configuration as the user has it, defaults written out."""
@@ -310,7 +312,7 @@ class _Replaying:
         for event in self.replay.recorded.events:
             if isinstance(event, Steer):
                 self._steer(event)
-            elif isinstance(event, Look):
+            elif isinstance(event, ReplayedScan):
                 self._look(event)
                 after[event.event.t_ns] = {name: robot.state for name, robot in self.robots.items()}
             else:
@@ -337,7 +339,7 @@ class _Replaying:
         for part in robot.drive.accept(replace(event, u=u, cov=None)):
             robot.move(part, rng)
 
-    def _look(self, look: Look) -> None:
+    def _look(self, look: ReplayedScan) -> None:
         """Look at the same landmarks; what cannot be seen from where the robot truly is is left out."""
         event, robot = look.event, self.robots[look.event.robot]
         for name in (event.robot, *(name for name in look.real if name in self.robots)):

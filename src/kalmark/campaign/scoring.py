@@ -52,7 +52,7 @@ SERIES = (
 )  # fmt: skip
 
 
-class Judged(NamedTuple):
+class BlockError(NamedTuple):
     """A block's error d (f,) in own and in world coordinates, and its Jacobian F (f, dof) in the block's error.
 
     `place` (k, 2|3) and `truth` (k, 2|3) are the points of it to align maps by.
@@ -106,7 +106,7 @@ def robot_turn(mean: Array, truth: Array) -> Any:
 
 def judge_landmark(
     model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array
-) -> Judged | None:
+) -> BlockError | None:
     """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
     if len(truth) in (4, 6):
         return _judge_line(model, mean, P, truth, turn, coordinates, eye) if isinstance(model, Segmented) else None
@@ -114,14 +114,14 @@ def judge_landmark(
         if len(mean) != 7:
             return None
         own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
-        return Judged(own, world, np.eye(6), mean[None, :3], truth[None, :3])
+        return BlockError(own, world, np.eye(6), mean[None, :3], truth[None, :3])
     point, F = _position(model, mean, len(truth))
     if isinstance(model, Pointed) and len(mean) > len(truth) and not _is_known(point, F @ P @ F.T, eye):
         return None
     own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
     if isinstance(model, Polar2D):  # its Gaussian is on an arc: so is its error
-        return Judged(_unrolled(mean, own), _unrolled(mean, world), F, point[None], truth[None])
-    return Judged(own, world, F, point[None], truth[None])
+        return BlockError(_unrolled(mean, own), _unrolled(mean, world), F, point[None], truth[None])
+    return BlockError(own, world, F, point[None], truth[None])
 
 
 def _unrolled(l: Array, error: Array) -> Array:
@@ -147,7 +147,7 @@ def _position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
 
 def _judge_line(
     model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array
-) -> Judged | None:
+) -> BlockError | None:
     """Judge a line by how far it passes from the two true ends (4|6,): in the plane two numbers, in space four."""
     l, d = mean[None], len(truth) // 2
     base, _ = model.endpoints(l, np.array([[0.0, 1.0]]))
@@ -163,7 +163,7 @@ def _judge_line(
         return None
     own, world = (point_error(q[0], ends, turn, c) @ across.T for c in (coordinates, "world"))
     F = (across @ Q_l[0]).reshape(own.size, -1)
-    return Judged(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)
+    return BlockError(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,18 +267,18 @@ class _Scorer:
         """
         slam, coordinates = self.slam, self.slam.estimator.coordinates
         turn = robot_turn(slam.mean(robot), self._state(robot, k))
-        judged: dict[Id, Judged] = {}
+        judged: dict[Id, BlockError] = {}
         here = [name for name in self.rows if name != robot and not slam.lags(name)]
         for name in (robot, *here):
             mean = slam.mean(name)
             dof = slam.robots[name].motion.space.dof
             own, world = (state_error(mean, self._state(name, k), turn, c) for c in (coordinates, "world"))
-            judged[name] = Judged(own, world, np.eye(dof))
-        mounts: dict[Id, Judged] = {}  # rotations of the world frame do not change them
+            judged[name] = BlockError(own, world, np.eye(dof))
+        mounts: dict[Id, BlockError] = {}  # rotations of the world frame do not change them
         errors = {name: pose_error(slam.mean(name)[: len(of.truth)], of.truth) for name, of in self.uncertain.items()}
         for name, of in self.uncertain.items():
             d = errors[name][of.open]
-            mounts[name] = Judged(d, d, np.eye(len(slam.covariance(name)))[np.flatnonzero(of.open)])
+            mounts[name] = BlockError(d, d, np.eye(len(slam.covariance(name)))[np.flatnonzero(of.open)])
         landmarks = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
         self._score_mounts({n: errors[n] for n, of in self.uncertain.items() if of.carrier == robot}, row, k)
         judged |= mounts | landmarks
@@ -290,7 +290,7 @@ class _Scorer:
         for key, value in zip(MAP_NEES, map_nees(d, P, first, sizes).tolist(), strict=True):
             self.series[key][row, k] = value
 
-    def _landmarks(self, turn: Any, eye: Array) -> Iterator[tuple[Id, Judged]]:
+    def _landmarks(self, turn: Any, eye: Array) -> Iterator[tuple[Id, BlockError]]:
         """Yield the landmarks that have a truth, and whose depth is known well enough."""
         slam, coordinates = self.slam, self.slam.estimator.coordinates
         points: dict[Id, Array] = {}
@@ -306,7 +306,7 @@ class _Scorer:
             truth, place = np.array([*points.values()]), np.array([slam.mean(name) for name in points])
             own, world = (point_error(place, truth, turn, c) for c in (coordinates, "world"))
             for i, name in enumerate(points):
-                yield name, Judged(own[i], world[i], np.eye(self.d), place[i : i + 1], truth[i : i + 1])
+                yield name, BlockError(own[i], world[i], np.eye(self.d), place[i : i + 1], truth[i : i + 1])
 
     def _score_mounts(self, errors: dict[str, Array], row: int, k: int) -> None:
         """Score mounts by their errors d (3|6,); a coordinate that is known exactly has no sigma to compare with."""

@@ -116,7 +116,7 @@ def live(
     overrides: Overrides = None,
 ) -> None:
     """Take events as lines of JSON on standard input or a socket; answer each with the estimate after it."""
-    from kalmark.results.live import Incoming, Live, converse
+    from kalmark.results.live import LineStream, Live, converse
     from kalmark.slam.slam import Slam
 
     if out is not None:
@@ -138,7 +138,7 @@ def live(
                 if listen is None:
                     incoming, outgoing = (typer.get_text_stream(n, "utf-8", "replace") for n in ("stdin", "stdout"))
                     handle = _descriptor(incoming)
-                    source = incoming if handle is None else Incoming(handle, kept.look, idle_s)
+                    source = incoming if handle is None else LineStream(handle, kept.look, idle_s)
                     converse(told, source, outgoing, kept.look)
                 else:
                     serve(told, listen, timeout, kept.look, idle_s)
@@ -175,7 +175,7 @@ def serve(
     A connection is closed if it sends nothing for `silent_s` (0: no limit), reads no answers, or uses another protocol.
     `look` is called after each answer, and whenever there was none for `idle_s`.
     """
-    from kalmark.results.live import Incoming, converse
+    from kalmark.results.live import LineStream, converse
 
     try:
         server = socket.create_server((HERE, port))
@@ -193,7 +193,7 @@ def serve(
             try:
                 connection.settimeout(silent_s or None)
                 with connection, connection.makefile("w", encoding="utf-8", newline="\n") as outgoing:
-                    incoming = Incoming(connection, look, idle_s, silent_s or None, stranger=True)
+                    incoming = LineStream(connection, look, idle_s, silent_s or None, stranger=True)
                     converse(told, incoming, outgoing, look)
             except OSError:  # the program is gone; the map stays for the next one
                 continue

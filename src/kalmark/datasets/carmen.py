@@ -47,7 +47,7 @@ MOST_M = 80.0  # of an old laser, which gives this, or a little more, for no ret
 STARTS = tuple(f"{tag} ".encode() for tag in (*LASERS, "ODOM"))
 
 
-class _Reader:
+class _CarmenReader:
     """Gathers the path of the odometry and the scans."""
 
     def __init__(self, path: Path, request: Request) -> None:
@@ -130,7 +130,7 @@ class _Reader:
 
 def read(path: Path, request: Request) -> Log:
     """Return the log.  Raises LogError, with file and line."""
-    reader = _Reader(path, request)
+    reader = _CarmenReader(path, request)
     for line, cells in text_rows(path):
         try:
             reader.take(cells)

@@ -57,7 +57,7 @@ class Noise:
         return 0.0 if self.stated else NOTHING
 
 
-class Estimate(NamedTuple):
+class NoiseEstimate(NamedTuple):
     """A noise by maximum likelihood: its value, the sigma of its logarithm, and whether the data determine it.
 
     At the `bound` are those that the data only bound from one side.
@@ -69,7 +69,7 @@ class Estimate(NamedTuple):
     bound: bool = False
 
 
-class Part(NamedTuple):
+class NoiseComponent(NamedTuple):
     """Part of a noise in the covariances: R (K, p, p) of each factor, Q (q n, q n) of the motion.
 
     `columns` (r,) are those of the root of the motion's covariance that it scales, None if it does more than that.
@@ -131,7 +131,7 @@ class Components:
         now = [values.get(noise, noise.stated) / noise.scale for noise in self.noises]
         return np.array([max(2.0 * math.log(max(x, 1e-300)), NOTHING) for x in now])
 
-    def fit(self, values: Mapping[Noise, float], fixed: Collection[Noise] = ()) -> dict[Noise, Estimate]:
+    def fit(self, values: Mapping[Noise, float], fixed: Collection[Noise] = ()) -> dict[Noise, NoiseEstimate]:
         """Return the estimate of each noise, beginning at some values.
 
         Those that are `fixed`, or that the data do not determine, are as stated.
@@ -147,7 +147,7 @@ class Components:
                 break
             free[np.argmax(np.where(vague, sigma, 0.0))] = False
         made = [
-            Estimate(noise.scale * math.exp(x / 2) if f else noise.stated, float(s), bool(f), bool(b and f))
+            NoiseEstimate(noise.scale * math.exp(x / 2) if f else noise.stated, float(s), bool(f), bool(b and f))
             for noise, x, s, f, b in zip(self.noises, t, sigma, free, bound, strict=True)
         ]
         return dict(zip(self.noises, made, strict=True))
@@ -194,13 +194,13 @@ class Components:
         return np.array(q) - sets.mean(axis=1), np.atleast_2d(np.cov(sets)), stretches @ stretches.T
 
 
-def _between(one: Problem, two: Problem) -> Part:
+def _between(one: Problem, two: Problem) -> NoiseComponent:
     """Return by how much the covariances of a problem are larger than those of another."""
     R = [b.R - a.R for a, b in zip(one.factors, two.factors, strict=True)]
     Q = sp.csr_array(two.motions.Q - one.motions.Q)
     Q.data[np.abs(Q.data) < 1e-12 * abs(one.motions.Q).max()] = 0.0
     Q.eliminate_zeros()
-    return Part(R, Q, _columns(one.motions, Q))
+    return NoiseComponent(R, Q, _columns(one.motions, Q))
 
 
 def _columns(motions: Motions, Q: sp.csr_array) -> Flags | None:
@@ -214,7 +214,7 @@ def _columns(motions: Motions, Q: sp.csr_array) -> Flags | None:
     return out if abs(square - Q).max() <= ROUNDING * max(abs(Q).max(), 1e-300) else None
 
 
-def _squares(linear: Linear, part: Part, left: Left) -> tuple[Array, Array]:
+def _squares(linear: Linear, part: NoiseComponent, left: Left) -> tuple[Array, Array]:
     """Return r_i (D r)_i (N, ...), D the whitened part of R, and m_i (Q m)_i (q n, ...)."""
     r = left.r if left.r.ndim == 2 else left.r[:, None]
     out, first = [], 0

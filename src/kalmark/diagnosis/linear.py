@@ -27,7 +27,7 @@ NONE = -1
 OUT = 1e3  # times its noise: what is so uncertain does not count
 
 
-class Rows(NamedTuple):
+class ResidualOrigins(NamedTuple):
     """Origin of each whitened residual (N,): factor and row there, column, landmark (-1: none) and node.
 
     `one` and `two` (P,) are the rows of successive observations of one landmark, by one sensor and column.
@@ -104,7 +104,7 @@ class Linear:
         return Reduced(replace(self.problem, motions=replace(self.problem.motions, root=self.root)), self.at)
 
     @cached_property
-    def rows(self) -> Rows:
+    def rows(self) -> ResidualOrigins:
         """Origin of each residual."""
         parts: list[tuple[Ints, ...]] = []
         for f, factor in enumerate(self.problem.factors):
@@ -121,7 +121,7 @@ class Linear:
         same = (landmark[one] >= 0) & (node[two] > node[one])
         for of_ in (landmark, column, factor_):
             same &= of_[one] == of_[two]
-        return Rows(factor_, row, column, landmark, node, one[same], two[same])
+        return ResidualOrigins(factor_, row, column, landmark, node, one[same], two[same])
 
     @cached_property
     def observations(self) -> Ints:

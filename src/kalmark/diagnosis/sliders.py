@@ -22,7 +22,7 @@ from kalmark.arrays import Array
 from kalmark.config import config_dict
 from kalmark.config.schema import Config
 from kalmark.diagnosis.tunable_keys import Keys, Values
-from kalmark.diagnosis.tune import Judged, Score, Task
+from kalmark.diagnosis.tune import Score, ScoredRun, Task
 from kalmark.errors import KalmarkError
 from kalmark.events import Scan
 from kalmark.files import write
@@ -173,7 +173,7 @@ def _nis_over_time(h: History) -> dict[str, Any]:
     }
 
 
-def _fit(task: Task, judged: Judged, before: Judged) -> dict[str, float | None]:
+def _fit(task: Task, judged: ScoredRun, before: ScoredRun) -> dict[str, float | None]:
     """Return NIS per degree of freedom, log-likelihood and share left out; None where the filter gave up."""
     score = task.scores(judged, before)[0] if len(judged.d2) == len(before.d2) else Score(np.nan, np.nan, np.nan)
     return dict(zip(("meanNis", "likelihood", "leftOut"), round_significant(np.array(score), 7), strict=True))

@@ -53,10 +53,10 @@ SWAPPED = "swapped_columns"
 NAMES = (SIGMA, SIGN, SCALE, CONSTANT, ARM, SWAPPED)
 
 
-Told = Callable[["Filtered"], tuple[str, str]]
+Told = Callable[["FilteredRun"], tuple[str, str]]
 
 
-class Filtered(NamedTuple):
+class FilteredRun(NamedTuple):
     """A run, and the fit of its observations."""
 
     run: Run
@@ -92,21 +92,23 @@ class Filtered(NamedTuple):
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
 
 
-def filtered_with(config: Mapping[str, Any], log: Log, events: list[Event]) -> Filtered | None:
+def filtered_with(config: Mapping[str, Any], log: Log, events: list[Event]) -> FilteredRun | None:
     """Return the fit of events under a configuration, None if they are refused."""
     run = filter_events(config, log, events)
     return None if run is None else fit_of_readings(run)
 
 
-def fit_of_readings(run: Run) -> Filtered:
+def fit_of_readings(run: Run) -> FilteredRun:
     """Return the fit of the observations of a run."""
-    return Filtered(run, fit_of_run(run))
+    return FilteredRun(run, fit_of_run(run))
 
 
 class _Sensor:
     """A sensor of the state, and the trials with it: events under a configuration, filtered as they are."""
 
-    def __init__(self, as_it_is: Filtered, config: Mapping[str, Any], log: Log, events: list[Event], of: Where) -> None:
+    def __init__(
+        self, as_it_is: FilteredRun, config: Mapping[str, Any], log: Log, events: list[Event], of: Where
+    ) -> None:
         self.as_it_is, self.config, self.log, self.events, self.where = as_it_is, config, log, events, of
         run = as_it_is.run
         self.sensor: Any = run.final_slam().robots[of[0]].sensors[of[1]].sensor
@@ -143,7 +145,7 @@ class _Sensor:
         gain = self.gain(after, scaled)
         return Mistake(name, *told(after), config, turned, gain) if gain > LEAST_GAIN else None
 
-    def gain(self, after: Filtered, scaled: bool = False) -> float:
+    def gain(self, after: FilteredRun, scaled: bool = False) -> float:
         """Return by how much likelier the log is in a second run; nothing where the readings do not fit in it.
 
         Readings that are scaled do not count themselves: the filter takes the noise of a control for its own, so that
@@ -209,7 +211,7 @@ class _Sensor:
         """Return that numbers of a sensor are not as stated, which are put into the map with a sigma."""
         config, path = with_value(self.config, (*self.path, *key), sigma), key[:-1]
 
-        def told(after: Filtered) -> tuple[str, str]:
+        def told(after: FilteredRun) -> tuple[str, str]:
             found = {m.name: mount_figures(m) for m in after.run.history.mounts}[".".join(self.where)]
             old = [float(configured_value(self.config, (*self.path, *path, n)) or (n == "scale")) for n in names]
             values = [
@@ -265,11 +267,11 @@ class _Sensor:
         return best[1] if best else None
 
 
-def _same(told: tuple[str, str], _: Filtered) -> tuple[str, str]:
+def _same(told: tuple[str, str], _: FilteredRun) -> tuple[str, str]:
     return told
 
 
-def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], Filtered | None]:
+def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], FilteredRun | None]:
     """Return the faults of sensors of the state in a run that does not fit, and the fit of the log without them.
 
     Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.

@@ -28,7 +28,7 @@ from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import NEAR, apply_calibration, sensors_of
 from kalmark.diagnosis.calibrations import ALPHA, calibrations
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
-from kalmark.diagnosis.components import Components, Estimate, Noise
+from kalmark.diagnosis.components import Components, Noise, NoiseEstimate
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.tunable_keys import Keys, Path_, Values
 from kalmark.errors import KalmarkError
@@ -131,7 +131,7 @@ def written_robots(config: str | Path, overrides: Sequence[str]) -> Mapping[str,
     return written if isinstance(written, dict) else {}
 
 
-class Judged(NamedTuple):
+class ScoredRun(NamedTuple):
     """A run over the whole log: which observations (O,) were used, their d2, degrees of freedom and log-likelihood."""
 
     run: Run
@@ -144,7 +144,7 @@ class Judged(NamedTuple):
 class _Fit(NamedTuple):
     """The estimates of a round and what they were made of."""
 
-    noises: dict[Noise, Estimate]
+    noises: dict[Noise, NoiseEstimate]
     found: list[Finding]
     components: Components
     run: Run
@@ -168,7 +168,7 @@ class Task:
         made = config_of(Tree(self.keys.changed(values)), None)
         return record(build_slam(made, log), log, progress=False, config=config_dict(made), pictures=False)
 
-    def judged(self, values: Values) -> Judged:
+    def judged(self, values: Values) -> ScoredRun:
         """Return the whole log filtered with some values."""
         run = self.run(values, self.log)
         h = run.history
@@ -179,9 +179,9 @@ class Task:
             mine = np.flatnonzero(dof == m)
             logdet = np.linalg.slogdet(h.Z[mine, :m, :m])[1]
             likelihood[mine] = -0.5 * (d2[mine] + logdet + m * math.log(2 * math.pi))
-        return Judged(run, h.outcome == "associated", d2, dof, likelihood)
+        return ScoredRun(run, h.outcome == "associated", d2, dof, likelihood)
 
-    def scores(self, judged: Judged, before: Judged) -> tuple[Score, Score]:
+    def scores(self, judged: ScoredRun, before: ScoredRun) -> tuple[Score, Score]:
         """Return the scores of both parts.
 
         An observation that was left out is as likely as at the edge of the gate before: no noise gains by leaving out.
@@ -331,7 +331,7 @@ class Task:
         ]
         return changes
 
-    def _held_out(self, values: Values, changes: list[Change], before: Judged) -> tuple[Values, list[Change]]:
+    def _held_out(self, values: Values, changes: list[Change], before: ScoredRun) -> tuple[Values, list[Change]]:
         """Return the values without those that do not make the second part's innovations likelier, and why."""
         whole = self.scores(self.judged(values), before)[1].likelihood
         base = self.scores(before, before)[1].likelihood
@@ -394,7 +394,7 @@ class Task:
         return rhos, float(np.median(np.sqrt(two[some] / one[some]))) if some.any() else 1.0, wide
 
 
-def values_of(noises: Mapping[Noise, Estimate]) -> dict[Noise, float]:
+def values_of(noises: Mapping[Noise, NoiseEstimate]) -> dict[Noise, float]:
     """Return the values of some estimates."""
     return {noise: estimate.value for noise, estimate in noises.items()}
 

@@ -103,7 +103,7 @@ def log_of_tables(
     globe: Globe | None = None,
 ) -> Log:  # fmt: skip
     """Return the log of tables, by the names of their CSV files.  Raises LogError with file and line."""
-    reader = _Reader(request, globe=globe)
+    reader = _NativeReader(request, globe=globe)
     for name, read_file in zip(FILES, reader.readers, strict=True):
         if name in there:
             reader.events += read_file(there[name]) or ()
@@ -148,7 +148,7 @@ class _Rows:
     empty: bool = False
 
 
-class _Reader:
+class _NativeReader:
     """Reads the files of a log, one method each, and gathers what is in them.
 
     `columns` are those of each robot's controls (sensor "") and of each sensor, `places` where they begin.  `in_order`:
@@ -336,7 +336,7 @@ def stream(path: Path, request: Request) -> Iterator[Event]:
 
     Raises LogError with file and line, for rows that are not in the order of time, too.
     """
-    reader, there = _Reader(request, in_order=True), tables(path)
+    reader, there = _NativeReader(request, in_order=True), tables(path)
     files = [
         _by_time(there[name], read_file(there[name]) or iter(()))
         for name, read_file in zip(FILES, reader.readers, strict=True)

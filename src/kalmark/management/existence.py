@@ -61,7 +61,7 @@ def concerns(scan: ScanContext, upkeep: Upkeep) -> bool:
     return hidden and scan.channel.has_limits
 
 
-class Look(NamedTuple):
+class ObservedAndMissed(NamedTuple):
     """The landmarks that a scan was `seen` to show, and those it `missed`, with what each miss counts.
 
     `density` is that of the landmarks about the sensor, per m^2, and `usual` that most of what it observed is mapped.
@@ -73,7 +73,7 @@ class Look(NamedTuple):
     usual: bool
 
 
-def look(scan: ScanContext, upkeep: Upkeep) -> Look | None:
+def look(scan: ScanContext, upkeep: Upkeep) -> ObservedAndMissed | None:
     """Return what a scan saw of what was expected, and count it; None if it is no look of its own.
 
     A scan of which most is not mapped is not counted: its robot may be elsewhere, or its sensor covered.
@@ -109,10 +109,10 @@ def look(scan: ScanContext, upkeep: Upkeep) -> Look | None:
     if usual:
         looks.take(pose, tracks.changes, far)
     r = np.concatenate(ranges)
-    return Look(seen, missed, len(r) / (math.pi * max(float(r.max(initial=0.0)), far) ** 2), usual)
+    return ObservedAndMissed(seen, missed, len(r) / (math.pi * max(float(r.max(initial=0.0)), far) ** 2), usual)
 
 
-def count_misses(tracks: Tracks, look: Look) -> list[Track]:
+def count_misses(tracks: Tracks, look: ObservedAndMissed) -> list[Track]:
     """Count the observations and the misses of the landmarks of a look; return those that it missed."""
     missed = [tracks.confirmed[name] for name in look.missed if name in tracks.confirmed]
     for track in missed:

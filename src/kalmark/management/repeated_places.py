@@ -57,7 +57,7 @@ MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one sh
 
 def find_repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
     """Return the repeats in a map of points in the plane, the surest first.  O(n log n)."""
-    look = _Look.of(map_, tracks)
+    look = _RepeatCandidates.of(map_, tracks)
     if look is None:
         return []
     found: list[tuple[_Constellation, Repeat]] = []
@@ -81,7 +81,7 @@ def find_repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _RepeatCandidates:
     """Landmarks (N,) that may be repeated: names, slots, places (N, 2), the `codes` a N + b of those seen in one scan.
 
     `given` (N,) have an id of the log.  `near` are the landmarks seen with each, the nearest first.  `tolerance` [m] is
@@ -100,7 +100,7 @@ class _Look:
     tree: Any
 
     @classmethod
-    def of(cls, map_: Map, tracks: Tracks) -> _Look | None:
+    def of(cls, map_: Map, tracks: Tracks) -> _RepeatCandidates | None:
         from scipy.spatial import cKDTree
 
         points = [track for track in tracks.confirmed.values() if len(track.covisible) > 2 and _is_point(track)]
@@ -157,7 +157,7 @@ def _relative_sigma(map_: Map, slots: Index, near: list[Index]) -> float:
 
 
 # ---------------------------------------------------------------------- hypotheses
-def _hypotheses(look: _Look) -> list[tuple[Array, Index]]:
+def _hypotheses(look: _RepeatCandidates) -> list[tuple[Array, Index]]:
     """Return transforms T (3,), each with the three pairs (3, 2) it is of; those first that fit most neighbours."""
     from scipy.spatial import cKDTree
 
@@ -180,7 +180,7 @@ def _hypotheses(look: _Look) -> list[tuple[Array, Index]]:
     return [(T[i], pairs[i]) for i in best[counts[best] >= FEWEST - 1].tolist()]
 
 
-def _triangles(look: _Look) -> tuple[Index, Array]:
+def _triangles(look: _RepeatCandidates) -> tuple[Index, Array]:
     """Return triangles (M, 3) of landmarks seen together, and their sides (M, 3) [m] and orientation as shapes (M, 4).
 
     The corners are ordered by the sides opposite to them.
@@ -222,7 +222,7 @@ def _moved(T: Array, p: Array) -> Array:
     return np.stack([c * x - s * y + T[:, :1], s * x + c * y + T[:, 1:2]], axis=2)
 
 
-def _agreeing_nearby(look: _Look, T: Array, pairs: Index) -> Index:
+def _agreeing_nearby(look: _RepeatCandidates, T: Array, pairs: Index) -> Index:
     """Return of each transform how many landmarks near its triangle it maps on others."""
     if not len(T):
         return np.zeros(0, dtype=np.int64)
@@ -255,7 +255,7 @@ class _Constellation:
         return 3 * len(mine & its) > min(len(mine), len(its))
 
 
-def _grown(look: _Look, T: Array, pairs: Index) -> _Constellation:
+def _grown(look: _RepeatCandidates, T: Array, pairs: Index) -> _Constellation:
     """Return a hypothesis with all pairs that agree with it.
 
     A landmark is of the part with which it was seen more often.
@@ -275,7 +275,7 @@ def _grown(look: _Look, T: Array, pairs: Index) -> _Constellation:
     return _Constellation(T, pairs, _missing(look, T, pairs) if len(pairs) >= FEWEST else 0)
 
 
-def _agreeing(look: _Look, T: Array, pairs: Index) -> tuple[Index, Index]:
+def _agreeing(look: _RepeatCandidates, T: Array, pairs: Index) -> tuple[Index, Index]:
     """Return the landmarks of the part of the first of pairs, and those of the other part, on which T moves them."""
     sides = _sides(look, pairs)
     middle = look.places[pairs[:, 0]].mean(axis=0)
@@ -293,7 +293,7 @@ def _agreeing(look: _Look, T: Array, pairs: Index) -> tuple[Index, Index]:
     return a[order[first]], b[order[first]]
 
 
-def _sides(look: _Look, pairs: Index) -> Index:
+def _sides(look: _RepeatCandidates, pairs: Index) -> Index:
     """Return of each landmark with how many more of the first than of the second of pairs it was seen (N,)."""
     votes = np.zeros(len(look.names), dtype=np.int64)
     for column, vote in ((0, 1), (1, -1)):
@@ -303,7 +303,7 @@ def _sides(look: _Look, pairs: Index) -> Index:
     return votes
 
 
-def _missing(look: _Look, T: Array, pairs: Index) -> int:
+def _missing(look: _RepeatCandidates, T: Array, pairs: Index) -> int:
     """Return how many landmarks of either part have no partner and are among those that have."""
     sides = _sides(look, pairs)
     rest = np.ones(len(sides), dtype=np.bool_)
@@ -335,7 +335,7 @@ def _area(p: Array) -> float:
 
 
 # ---------------------------------------------------------------------- judgement
-def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> Repeat | None:
+def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constellation]) -> Repeat | None:
     """Return the repeat that a constellation is, None if it may be chance."""
     from scipy.special import betainc
 
@@ -381,7 +381,7 @@ def _judged(look: _Look, found: _Constellation, all_: list[_Constellation]) -> R
     return Repeat(named, T, middle, shift, score, p, agrees, sure, _newer(look, pairs))
 
 
-def _newer(look: _Look, pairs: Index) -> list[Id]:
+def _newer(look: _RepeatCandidates, pairs: Index) -> list[Id]:
     """Return the landmarks of the newer part: by those that they were seen with, else by age.
 
     It begins where fewest of the pairs have one on the wrong side, which was taken for another: these do not count.
@@ -401,7 +401,7 @@ def _differ(one: _Constellation, other: _Constellation) -> bool:
     return 2 * len(mine & its) < min(len(mine), len(its))
 
 
-def _self_similarity(look: _Look, part: Index) -> float:
+def _self_similarity(look: _RepeatCandidates, part: Index) -> float:
     """Return the probability with which landmarks of a part agree with others of it that are certainly different.
 
     Each edge between two that were seen together is moved on each other; the probability is that of which the best
@@ -437,7 +437,7 @@ def _self_similarity(look: _Look, part: Index) -> float:
     return float(betaincinv(k, m - k + 1, 1.0 / number).max())
 
 
-def _weighed(look: _Look, T: Array, pairs: Index, density: float) -> tuple[float, bool, bool]:
+def _weighed(look: _RepeatCandidates, T: Array, pairs: Index, density: float) -> tuple[float, bool, bool]:
     """Return the log-likelihood ratio of pairs that are one, T unknown, whether their shapes fit, and places do."""
     some = pairs[:: max(1, -(-len(pairs) // WEIGHED))]
     k, rows = len(some), np.concatenate([some[:, 0], some[:, 1]])

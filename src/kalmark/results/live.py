@@ -100,7 +100,7 @@ class Live:
         return [row | {"mean": row["mean"].tolist(), "covariance": row["covariance"].tolist()} for row in rows]
 
 
-class Incoming:
+class LineStream:
     """The lines that a program writes to a pipe (its descriptor) or to a socket.
 
     `idle` is called whenever nothing has come for `idle_s`.  Of a `stranger`, the first character has to be that of an
@@ -160,7 +160,7 @@ class Incoming:
 
 
 def converse(
-    live: Live, incoming: TextIO | Incoming, outgoing: TextIO, after: Callable[[], object] = lambda: None
+    live: Live, incoming: TextIO | LineStream, outgoing: TextIO, after: Callable[[], object] = lambda: None
 ) -> None:
     """Answer each line until there are no more, or the filter is lost; blank lines have no answer.
 

@@ -346,7 +346,7 @@ def wall_corners(walls: Array) -> Array:
     return np.array(found).reshape(-1, 2)
 
 
-class Placed(Section):
+class ViewerPose(Section):
     """A pose: x to the right of a viewer, y down, z away from the viewer."""
 
     x_m: Number = 0.0
@@ -368,7 +368,7 @@ class Placed(Section):
         return from_euler_pose(np.array([self.x_m, self.y_m, self.z_m, *turns]))[0]
 
 
-class ListedTag(Placed):
+class ListedTag(ViewerPose):
     """A tag: x to the right of a viewer, y down, z away from the viewer, into the wall behind it."""
 
     size_m: Positive = 0.3

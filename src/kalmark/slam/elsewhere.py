@@ -115,7 +115,7 @@ def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> l
     return [k for k, is_one in zip(far, is_seen.tolist(), strict=True) if is_one]
 
 
-def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
+def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | None) -> None:
     """Count the landmarks that a scan observed and missed, and place its robot where the odds suffice."""
     robot = scan.event.robot
     if look is not None or scan.adrift:
@@ -140,7 +140,7 @@ def weigh(state: State, scan: ScanContext, look: existence.Look | None) -> None:
         of.fitted = set()
 
 
-def _note(state: State, scan: ScanContext, of: Evidence, look: existence.Look | None) -> None:
+def _note(state: State, scan: ScanContext, of: Evidence, look: existence.ObservedAndMissed | None) -> None:
     """Take note of the landmarks that a scan saw, missed and began."""
     made, t_ns = scan.report.observations, scan.event.t_ns
     if look is not None:

@@ -70,7 +70,7 @@ class _Block(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Factor:
+class BlockMeasurement:
     """A measurement y (p,) of blocks by their `names`, with the noise R (p, p).
 
     `expect` returns its expectation from their means, `angular` (p,) marks angles; `what` names it in messages.
@@ -124,7 +124,9 @@ class Factor:
         return d2, Start(Rn(len(e)), value, parts, G, np.zeros((len(e), len(e))))
 
 
-def factor_of(names: Sequence[Id], expect: Callable[..., Any], y: Any, cov: Any, angular: Sequence[bool]) -> Factor:
+def factor_of(
+    names: Sequence[Id], expect: Callable[..., Any], y: Any, cov: Any, angular: Sequence[bool]
+) -> BlockMeasurement:
     """Return a factor of the blocks `names`.  Raises EventError for numbers that it cannot have."""
     own, what = _checked_names(names)
     if not callable(expect):
@@ -137,7 +139,7 @@ def factor_of(names: Sequence[Id], expect: Callable[..., Any], y: Any, cov: Any,
     turns = [*angular] if isinstance(angular, list | tuple) and len(angular) in (0, p) else [None]
     if not all(isinstance(each, bool) for each in turns):
         raise EventError(f"{what}: angular is {short_text(angular)}, expected {p} truth values")
-    return Factor(own, expect, y, R, np.array(turns or [False] * p), what)
+    return BlockMeasurement(own, expect, y, R, np.array(turns or [False] * p), what)
 
 
 def _checked_names(names: Any) -> tuple[list[Id], str]:
@@ -150,7 +152,7 @@ def _checked_names(names: Any) -> tuple[list[Id], str]:
     return own, what
 
 
-def correct_by_factor(state: State, factor: Factor, share: float) -> Observation:
+def correct_by_factor(state: State, factor: BlockMeasurement, share: float) -> Observation:
     """Correct by a factor if d2 is within the gate of the probability `share`."""
     if not is_number(share) or not 0.0 < share <= 1.0:
         raise EventError(f"{factor.what}: gate is {short_text(share)}, expected a probability above 0, 1 for no gate")

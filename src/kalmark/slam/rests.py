@@ -54,7 +54,7 @@ class WindowMean(NamedTuple):
 
 
 @dataclass
-class Source:
+class WatchedSensor:
     """The controls (`sensor` is None) or the readings of a sensor by `name`, of which the columns `at` are watched.
 
     `still` (1, 3 or 6) is the twist of a robot that stands.  With `per_s` columns are ways, to be divided by their
@@ -125,7 +125,7 @@ class Standing:
     """Detector of a robot that stands, window by window; `sensor` has the thresholds."""
 
     began_ns: int | None
-    sources: dict[str, Source]
+    sources: dict[str, WatchedSensor]
 
     def __init__(self, sensor: Any, robot: Robot) -> None:
         self.sensor, self.robot, self.motion = sensor, robot.name, robot.motion
@@ -188,7 +188,7 @@ class Standing:
         return abs(m.mean) <= slowest - self._sure * m.sigma
 
 
-def sources_of(robot: Robot) -> list[Source]:
+def sources_of(robot: Robot) -> list[WatchedSensor]:
     """Return the inputs that show whether a robot stands: its controls, unless impulses, and its own sensors."""
     motion, plane = robot.motion, robot.motion.space.world == "plane"
     still, found = np.zeros((1, 3 if plane else 6)), list[tuple[str, Any, tuple[str, ...], bool]]()
@@ -203,5 +203,5 @@ def sources_of(robot: Robot) -> list[Source]:
         used = SHAKEN if sensor is not None and sensor.views == POSE else ALONG | ASIDE | TURNS
         at = [i for i, column in enumerate(columns) if column in used]
         if at:
-            sources.append(Source(name, sensor, tuple(columns[i] for i in at), at, still, per_s))
+            sources.append(WatchedSensor(name, sensor, tuple(columns[i] for i in at), at, still, per_s))
     return sources

@@ -66,7 +66,7 @@ from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy, refuse_other_world
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.robot import Robot, robots_given
-from kalmark.slam.sources import RawDetector, Replay, Source
+from kalmark.slam.sources import BufferedScans, RawDetector, Source
 from kalmark.slam.starting import SINGULAR
 from kalmark.slam.state import CURE, Settings, State
 from kalmark.tracks.scan import ScanContext
@@ -245,7 +245,7 @@ class Slam(Estimate):
             self._begin_again(source, replay)
         return report
 
-    def _begin_again(self, source: Source, replay: Replay) -> None:
+    def _begin_again(self, source: Source, replay: BufferedScans) -> None:
         """Filter all scans of a source so far again, landmarks starting at the inverse distances that are known now."""
         again = Slam(self.robots.values(), **vars(self.state.settings))
         state, key, poses = again.state, (replay.scans[0][0].robot, replay.scans[0][0].sensor), []

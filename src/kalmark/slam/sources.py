@@ -42,7 +42,7 @@ class Found(NamedTuple):
     drifted: tuple[list[Id], float] | None = None
 
 
-class Replay(NamedTuple):
+class BufferedScans(NamedTuple):
     """The scans so far, each with the landmarks given up before it, to be filtered again from the first one on.
 
     `rho` are inverse distances, 1/m, at which landmarks are to start then.
@@ -55,7 +55,8 @@ class Replay(NamedTuple):
 class Source(Protocol):
     """Makes scans of the raw data of one sensor, of the kind that it `takes`.
 
-    It `begins` as long as it keeps its first scans for a `Replay`; one that `waits` makes none until no other begins.
+    It `begins` as long as it keeps its first scans for a `BufferedScans`; one that `waits` makes none until no other
+    begins.
     """
 
     takes: ClassVar[type[Raw]]
@@ -78,7 +79,7 @@ class Source(Protocol):
         """Return the scan of the data of an event, to the time of which the filter has predicted."""
         ...
 
-    def update(self, report: Report, view: FilterView) -> Replay | None:
+    def update(self, report: Report, view: FilterView) -> BufferedScans | None:
         """Update its state by the report of its last scan; return what is to be filtered again, None for nothing."""
         ...
 

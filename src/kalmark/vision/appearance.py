@@ -38,7 +38,7 @@ class View:
     frame: int = 0
 
 
-class Looks(NamedTuple):
+class ExpectedAppearance(NamedTuple):
     """Expected appearance of K landmarks: `templates` (K, s, s), of which those `valid` (n,) hold.
 
     `likeness` (K, 2) is the cosine of the angle between the directions of view and the scale, of the best view of each.
@@ -87,7 +87,7 @@ def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[V
 
 def predict_templates(
     cv2: Any, views: list[list[View]], planes: list[Plane | None], places: Array, T: Array, sensor: Any, h: int
-) -> Looks:  # fmt: skip
+) -> ExpectedAppearance:  # fmt: skip
     """Return the expected templates of landmarks at `places` (K, 3) from T, of half width h."""
     best, likeness = best_views(views, places, T)
     templates, done = np.zeros((len(best), 2 * h + 1, 2 * h + 1), np.uint8), []
@@ -97,7 +97,7 @@ def predict_templates(
         if view is not None and likeness[k, 0] > LEAST_COSINE and 1 / MOST_SCALE < likeness[k, 1] < MOST_SCALE
     ]  # fmt: skip
     if not valid:
-        return Looks(templates, np.zeros(0, np.int64), likeness, rates)
+        return ExpectedAppearance(templates, np.zeros(0, np.int64), likeness, rates)
     shown = [(view, plane) for view, plane in ((best[k], planes[k]) for k in valid) if view and plane]
     turns = np.array([matrix(view.T[3:]) for view, _ in shown])
     normals = np.array([plane.normal for _, plane in shown])[:, None] + DIFFERENCE * (
@@ -128,4 +128,4 @@ def predict_templates(
         flags, border = cv2.INTER_LINEAR, cv2.BORDER_REPLICATE
         done.append(k)
         templates[k] = cv2.warpPerspective(view.patch, warp, (2 * h + 1, 2 * h + 1), flags=flags, borderMode=border)
-    return Looks(templates, np.array(done, dtype=np.int64), likeness, rates)
+    return ExpectedAppearance(templates, np.array(done, dtype=np.int64), likeness, rates)

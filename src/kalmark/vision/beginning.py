@@ -21,7 +21,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.events import Id, Scan
 from kalmark.geometry.rotations import conjugate, exp, from_matrix, left_jacobian, log, matrix, multiply, skew
-from kalmark.slam.sources import Replay
+from kalmark.slam.sources import BufferedScans
 
 FIRST, LATER, LAST = 8, 1.4, 250  # frames: the first attempt, how much later the next one is, the last one
 FRAMES, FEWEST = 8, 12  # that are fitted, spread over all; landmarks that must be left
@@ -30,7 +30,7 @@ SURE = 25.0  # by so many times the variance of a residual the reversed solution
 LEAST_RHO = 0.02  # of the median inverse distance: what is found to be farther begins there
 
 
-class Fit(NamedTuple):
+class Reconstruction(NamedTuple):
     """Poses of F frames, w (F, 3) and t (F, 3), inverse distances rho (N,), and the sum of squares, px^2, robust."""
 
     w: Array
@@ -56,7 +56,7 @@ class Beginning:
         self.poses.append(T.copy())
         self.matched.append(fitted)
 
-    def tried(self, cv2: Any, sensor: Any, prior: float) -> Replay | None:
+    def tried(self, cv2: Any, sensor: Any, prior: float) -> BufferedScans | None:
         """Return the start of the map, once determined; the median of its inverse distances is the `prior`, 1/m."""
         k = len(self.scans) - 1
         if self.over or k < self.next:
@@ -75,7 +75,7 @@ class Beginning:
         if fit is None:
             return None
         rho = np.maximum(fit.rho / np.median(fit.rho), LEAST_RHO) * prior
-        begun = Replay(self.scans, dict(zip(left, rho.tolist(), strict=True)))
+        begun = BufferedScans(self.scans, dict(zip(left, rho.tolist(), strict=True)))
         self.end()
         return begun
 
@@ -83,7 +83,9 @@ class Beginning:
         """Keep no more frames."""
         self.over, self.scans, self.poses, self.matched = True, [], [], []
 
-    def _sure(self, cv2: Any, sensor: Any, rays: Array, y: Array, some: list[int], prior: float) -> Fit | None:
+    def _sure(
+        self, cv2: Any, sensor: Any, rays: Array, y: Array, some: list[int], prior: float
+    ) -> Reconstruction | None:
         """Return the fit to y (F, N, 2) if the landmarks are seen under some parallax and none other is as good."""
         first = self.poses[0]
         back = matrix(first[3:]).T
@@ -132,7 +134,7 @@ def solve_essential_matrix(
     return log(from_matrix(np.ascontiguousarray(Q.T))), t * middle / prior, rho * prior / middle
 
 
-def fit_poses(sensor: Any, rays: Array, y: Array, w: Array, t: Array, rho: Array, prior: float) -> Fit:
+def fit_poses(sensor: Any, rays: Array, y: Array, w: Array, t: Array, rho: Array, prior: float) -> Reconstruction:
     """Fit poses w, t (F, 3) and rho (N,) to pixels y (F, N, 2), NaN where there is none, of unit rays (N, 3).
 
     Residuals of more than a pixel count less (Huber 1964); rho is kept about the prior +- the same.
@@ -150,7 +152,7 @@ def fit_poses(sensor: Any, rays: Array, y: Array, w: Array, t: Array, rho: Array
     z = residuals(sensor, rays, y, seen, made.x)[0].reshape(-1, 2)
     middle = float(np.median(np.sum(z * z, axis=1))) / (2.0 * np.log(2.0))  # of a chi-square of 2
     w, t = made.x[: 6 * frames].reshape(2, frames, 3)
-    return Fit(w, t, made.x[6 * frames :], 2.0 * float(made.cost), max(middle, 1e-4))
+    return Reconstruction(w, t, made.x[6 * frames :], 2.0 * float(made.cost), max(middle, 1e-4))
 
 
 def residuals(sensor: Any, rays: Array, y: Array, seen: Flags, x: Array) -> tuple[Array, Array]:

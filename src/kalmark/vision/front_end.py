@@ -22,7 +22,7 @@ from kalmark.geometry.rotations import matrix
 from kalmark.models.protocols import UnknownDepth, finds_depth, has_second_camera
 from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
-from kalmark.slam.sources import FilterView, Found, Replay
+from kalmark.slam.sources import BufferedScans, FilterView, Found
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predict_templates, take_view
 from kalmark.vision.beginning import Beginning
 from kalmark.vision.depth_images import inverse_depths, with_depths
@@ -33,7 +33,7 @@ from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane, plane_from_depths, plane_from_match
 from kalmark.vision.recognition import match_expected, recognize_place
 from kalmark.vision.searches import TRIAL, Searches, make_room
-from kalmark.vision.selection import Search, Selection
+from kalmark.vision.selection import ImageSearch, Selection
 from kalmark.vision.surveyed_corners import FirstLook
 from kalmark.vision.template_matching import Searcher, shift_covariances
 
@@ -76,7 +76,7 @@ class ActiveSearch:
 
 
 @dataclass
-class Look(Searches):
+class LandmarkViews(Searches):
     """Views of a landmark, and its counts of searches, matches and fits."""
 
     views: list[View] = field(default_factory=list)
@@ -91,7 +91,7 @@ class FrontEnd:
     waits: ClassVar[bool] = False
     random: np.random.Generator
     cells: Cells
-    looks: dict[Id, Look]
+    looks: dict[Id, LandmarkViews]
     frame: int
     named: int
     beginning: Beginning | None
@@ -151,7 +151,7 @@ class FrontEnd:
         )
         self.beside = beside if isinstance(self.sensor, PixelDepth) else None
         searcher = Searcher(cv2, image, looks.templates, settings.accept)
-        search, drifted = Search(prospect, looks.valid, searcher, settings.updates), None
+        search, drifted = ImageSearch(prospect, looks.valid, searcher, settings.updates), None
         found = self.selection = search.run(self.random)
         again = self._matched_again(image, prospect, searcher)
         if again is not None and search.run_again(*again).wider > 1.0:
@@ -177,7 +177,7 @@ class FrontEnd:
         self.observation = Found(scan, removed, drifted)
         return self.observation
 
-    def update(self, report: Report, view: FilterView) -> Replay | None:
+    def update(self, report: Report, view: FilterView) -> BufferedScans | None:
         """Update patches and counts of landmarks by the report of a frame; return what is to be filtered again."""
         T = view.T
         assert self.prospect is not None
@@ -190,7 +190,7 @@ class FrontEnd:
             if o.outcome == "new" and name not in self.looks:  # else it was only started again
                 shot = self._taken(y, T)
                 if shot is not None:
-                    look = self.looks[name] = Look(views=[shot], seen=self.frame)
+                    look = self.looks[name] = LandmarkViews(views=[shot], seen=self.frame)
                     look.plane = self._plane(y, shot)
                 continue
             look, k = self.looks[name], at[name]
@@ -216,7 +216,7 @@ class FrontEnd:
         return self._begun(view.channel.landmark)
 
     # ------------------------------------------------------------------ the beginning
-    def _begun(self, landmark: Any) -> Replay | None:
+    def _begun(self, landmark: Any) -> BufferedScans | None:
         """Return, once, the start of the map, if the first frames determine it; the median of rho is the prior."""
         if self.beginning is None or not isinstance(landmark, UnknownDepth) or landmark.prior_rho_per_m <= 0.0:
             return None
@@ -238,7 +238,7 @@ class FrontEnd:
 
     def survey(self, name: Id) -> None:
         """Search, too, for a landmark known beforehand: its patch is taken where it is first seen."""
-        self.looks[name] = Look(surveyed=True)
+        self.looks[name] = LandmarkViews(surveyed=True)
 
     def restored(self) -> None:
         """Check the views of a file.  Raises MapError."""

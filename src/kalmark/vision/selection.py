@@ -44,7 +44,7 @@ class Selection:
     wider: float = 1.0
 
 
-class Search:
+class ImageSearch:
     """One search of an image for the landmarks of a prospect; `valid` (n,) are those of which there is a template."""
 
     def __init__(self, prospect: Prospect, valid: Index, searcher: Searcher, updates: int) -> None:

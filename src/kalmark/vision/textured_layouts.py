@@ -17,7 +17,7 @@ from kalmark.events import Frame
 from kalmark.geometry.frames3d import from_euler_pose, from_frame
 from kalmark.models.observe import sensor_pose
 from kalmark.models.sensors import PixelDepth, Stereo
-from kalmark.simulate.layouts import LayoutSection, Placed, Scenery, pose_at_wall
+from kalmark.simulate.layouts import LayoutSection, Scenery, ViewerPose, pose_at_wall
 from kalmark.vision.rendering import Rectangle, Renderer, render, rendered_depth, texture
 
 PANEL_M = 0.4, 1.0  # width and height of a panel
@@ -40,7 +40,7 @@ def camera_of(planes: list[Rectangle], model: Any, sensing: Any) -> Callable[[Ar
     return frame_at
 
 
-class ListedPlane(Placed):
+class ListedPlane(ViewerPose):
     """A rectangle with a random texture; its axes are those of a tag."""
 
     width_m: Positive = 1.0

@@ -93,7 +93,7 @@ def read(
                       start=AT_REST if start is None else start)  # fmt: skip
 
 
-class Table(NamedTuple):
+class TimedRows(NamedTuple):
     """Rows (N, m) at times (N,) ns."""
 
     t_ns: Times
@@ -112,7 +112,7 @@ def lines_of(file: Path) -> Iterator[tuple[int, list[str]]]:
             yield line, [cell.strip() for cell in content.split(",")]
 
 
-def csv_of(file: Path, columns: int) -> Table | None:
+def csv_of(file: Path, columns: int) -> TimedRows | None:
     """Return a table of EuRoC, ns and numbers, without rows that run back in time; None if there is no such file.
 
     Raises LogError.
@@ -130,10 +130,10 @@ def csv_of(file: Path, columns: int) -> Table | None:
             raise LogError(f"{file}:{line}: {row}, expected {columns - 1} finite numbers after the time") from None
     if not found:
         raise LogError(f"{file}:1: no rows of data, expected times in ns and numbers")
-    return Table(np.array([*found], dtype=np.int64), np.array([*found.values()]))
+    return TimedRows(np.array([*found], dtype=np.int64), np.array([*found.values()]))
 
 
-def true_states(path: Path) -> Table | None:
+def true_states(path: Path) -> TimedRows | None:
     """Return the true states: x y z, qx qy qz qw, velocity, biases of rate and force (16,); None without a file.
 
     They are those of the layout, or of the only file `gt*.csv` beside `mav0`.  Raises LogError.
@@ -149,10 +149,10 @@ def true_states(path: Path) -> Table | None:
     order = [0, 1, 2, 4, 5, 6, 3, *range(7, 16)]  # EuRoC's quaternions begin with w
     states = table.rows[:, order]
     states[:, 3:7] /= np.linalg.norm(states[:, 3:7], axis=1, keepdims=True)
-    return Table(table.t_ns, states)
+    return TimedRows(table.t_ns, states)
 
 
-def start_section(states: Table, t_ns: int) -> Section | None:
+def start_section(states: TimedRows, t_ns: int) -> Section | None:
     """Return the true state at a time (ns) as the section of a start, None if that is outside the true states."""
     after = int(np.searchsorted(states.t_ns, t_ns))
     if t_ns < states.t_ns[0] or after == len(states.t_ns):
