@@ -12,8 +12,8 @@ from kalmark.association.wall_segments import disjoint_from_walls
 from kalmark.compiled import form_for
 from kalmark.events import Id
 from kalmark.filter import corrections, kernels
+from kalmark.filter.known_marginal import append_known
 from kalmark.filter.layout import P_AT
-from kalmark.filter.local import append_known
 from kalmark.filter.map import Marginal, Pairs
 from kalmark.filter.observed_block import add_blocks, observed_block
 from kalmark.geometry.landmark_density import NEIGHBOURS, log_density, log_volume_change

@@ -12,7 +12,7 @@ from kalmark.bags.configured_topics import short
 from kalmark.bags.first_readings import Readings
 from kalmark.bags.first_sensors import CLUSTERS, IDS, entry_of, is_tag, section_line
 from kalmark.bags.first_start import POSE_M, start_of
-from kalmark.bags.first_words import GUESS, Entry, topic_text, yaml_mapping, yaml_text
+from kalmark.bags.first_text import GUESS, Entry, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.importer import DAY_NS
 from kalmark.bags.survey import Poses, Survey, TopicSummary, yaw
 from kalmark.bags.tf_frames import BASES

@@ -12,7 +12,7 @@ from kalmark.arrays import Array
 from kalmark.bags.configured_topics import sensor_name
 from kalmark.bags.first_sensors import mount_of
 from kalmark.bags.first_start import EstimatedStart
-from kalmark.bags.first_words import GUESS, Entry, topic_text, yaml_mapping, yaml_text
+from kalmark.bags.first_text import GUESS, Entry, topic_text, yaml_mapping, yaml_text
 from kalmark.bags.inertial_messages import heading_of, heading_of_field
 from kalmark.bags.messages import Measured
 from kalmark.bags.survey import Survey, TopicSummary

@@ -6,7 +6,7 @@ from typing import Any
 
 from kalmark.arrays import Array
 from kalmark.bags.configured_topics import sensor_name
-from kalmark.bags.first_words import GUESS, yaml_mapping
+from kalmark.bags.first_text import GUESS, yaml_mapping
 from kalmark.bags.survey import Survey, TopicSummary
 from kalmark.bags.topics import Scans
 from kalmark.geometry.named_poses import describe_pose

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.bags.first_words import GUESS, Entry
+from kalmark.bags.first_text import GUESS, Entry
 from kalmark.bags.survey import Poses, Survey, TopicSummary, yaw
 from kalmark.logs.geodesy import to_tangent_plane
 from kalmark.logs.log import poses_of_size

@@ -38,8 +38,8 @@ from kalmark.logs.progress import track
 from kalmark.results.figure_texts import figure
 from kalmark.results.history import RobotStart
 from kalmark.results.measures import Rigid, level, level_sigmas, rmse
-from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
+from kalmark.results.wrong_starts import restarts
 
 FEW_SCANS = 20, 80  # at first: of most mistakes a log shows soon that they were not made
 LIKELIEST = 5  # kinds of mistakes by the first scans, that are tried in more

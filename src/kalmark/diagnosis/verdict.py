@@ -42,10 +42,10 @@ from kalmark.results.figure_texts import count, figure
 from kalmark.results.gauge import shape_of_points
 from kalmark.results.history import RelocatedRobot
 from kalmark.results.measures import Rigid, rigid, rmse
-from kalmark.results.restarts import restarts
 from kalmark.results.run import Run
 from kalmark.results.verdict_text import INNOVATIONS, NO_BATCH, NO_LANDMARKS, NO_MAP
 from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, signs, window_warnings, words_of
+from kalmark.results.wrong_starts import restarts
 from kalmark.slam.elsewhere import ODDS
 from kalmark.slam.replacing import NEEDED
 from kalmark.slam.surveyed_corrections import ELSEWHERE

@@ -32,7 +32,7 @@ from kalmark.results.filter_description import mounts_of
 from kalmark.results.history import History, RobotStart, as_id, ints
 from kalmark.results.landmark_table import refuse_other_than_points
 from kalmark.results.measures import nees, pose_error, rigid, rmse
-from kalmark.results.restarts import Restart, restarts
+from kalmark.results.wrong_starts import Restart, restarts
 from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 

@@ -34,10 +34,10 @@ from kalmark.results.measures import (
 )
 from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_figures, repeat_notes
-from kalmark.results.restarts import restarts
 from kalmark.results.self_calibration import bias_figures, mount_figures
 from kalmark.results.truth import Truth
 from kalmark.results.warnings import advice, fix_nis_per_dof, warnings, window_figures
+from kalmark.results.wrong_starts import restarts
 
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0

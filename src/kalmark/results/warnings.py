@@ -37,8 +37,8 @@ from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix, grou
 from kalmark.results.measures import associated_nis, nis, place_sigma, truncated_variance
 from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_warnings
-from kalmark.results.restarts import restarts
 from kalmark.results.self_calibration import mount_warnings
+from kalmark.results.wrong_starts import restarts
 from kalmark.slam.held_readings import AGAIN
 
 DEGREES = 100  # of freedom in a window, at least

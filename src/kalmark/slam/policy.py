@@ -41,11 +41,11 @@ class Policy:
     `deferred` starts landmarks with ids from several measurements, `delayed` any landmark from cloned poses (None: at
     first sight).  `starts` are the answers to an observation without an id that start one.  `averages`: the association
     may answer with mixtures; `holds_back`: its pairs are tested against chance; `reviews`: landmarks may change after a
-    scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the
-    last `keep_poses` clones are kept for tentative landmarks.  `restarts`: rays may have to be started again
-    (`baselines.py`).  `contests`: where a landmark with an id was begun is weighed against observations that do not fit
-    (`tentative.py`), which are left out or count less.
-    `by_ids`: nothing is to be decided of a scan whose ids are of landmarks of one type in the map.
+    scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the last
+    `keep_poses` clones are kept for tentative landmarks.  `restarts`: rays may have to be started again
+    (`ray_restarts.py`).  `contests`: where a landmark with an id was begun is weighed against observations that do not
+    fit (`tentative.py`), which are left out or count less.  `by_ids`: nothing is to be decided of a scan whose ids are
+    of landmarks of one type in the map.
     """
 
     association: Association

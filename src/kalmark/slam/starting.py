@@ -11,7 +11,7 @@ import numpy as np
 from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Decision, Mixture
 from kalmark.errors import MapError
 from kalmark.events import Id
-from kalmark.management import ambiguous_tags, baselines, delayed, wall_growth
+from kalmark.management import ambiguous_tags, delayed, ray_restarts, wall_growth
 from kalmark.management.pending import Initialization, Step
 from kalmark.models.protocols import distances_alone
 from kalmark.report import ALONE, Observation
@@ -81,7 +81,9 @@ def take_open_rays(
         slots = state.tracks.slots_of([decisions[k][0] for k in rows])
         found += [
             k
-            for k, is_open in zip(rows, baselines.rays_without_baseline(scan, model, slots, rows).tolist(), strict=True)
+            for k, is_open in zip(
+                rows, ray_restarts.rays_without_baseline(scan, model, slots, rows).tolist(), strict=True
+            )
             if is_open
         ]
         rows[:] = [k for k in rows if k not in found]

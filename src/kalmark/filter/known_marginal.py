@@ -1,4 +1,4 @@
-"""A small map of some blocks and of landmarks known exactly beside them: what a query needs, no more.
+"""Joint marginals with landmarks known exactly, as a small map of a query.
 
 Landmarks known exactly have no block in the map.  An association compares with the few near ones as with any others:
 here they are blocks whose covariance is zero.
