@@ -1,6 +1,6 @@
 """A robot that is carried away unnoticed: is it found by its landmarks, and when?  One that is not: does it stay?
 
-    python benchmarks/carried.py                       # three fields, with ids and without, 5 seeds
+    python benchmarks/carried.py                       # four fields, with ids and without, 5 seeds
     python benchmarks/carried.py --worlds dense --runs 20
 
 A piece is cut out of a simulated log, after the robot has been round: its events stop at one place and go on at
@@ -24,7 +24,13 @@ from kalmark.report import Gap
 from kalmark.results.measures import rigid
 from kalmark.simulate import load_world, simulate
 
-WORLDS = {"random_field": [], "sparse": ["world.count=25"], "dense": ["world.count=120"]}  # and their keys
+LIDAR = "filter.robots.rover.sensors.lidar"
+WORLDS = {  # and their keys
+    "random_field": [],
+    "sparse": ["world.count=25"],
+    "dense": ["world.count=120"],
+    "no limits stated": [f"{LIDAR}.range_min_m=0", f"{LIDAR}.range_max_m=.inf", f"{LIDAR}.fov_rad=6.2832"],
+}
 STEPS = 1200
 FROM, TO, RIGHT_M = 0.6, 0.75, 0.5  # of the log is cut out
 
@@ -71,7 +77,7 @@ def main() -> None:
         runs = [carried_runs(WORLDS[world], ids, seed) for seed in range(args.runs)]
         lasts = [gap.lasts_s for _, gaps, _, _ in runs for gap in gaps] or [np.nan]
         print(
-            f"{world:12} {'ids' if ids else 'no ids':6} found {sum(found for found, *_ in runs)} of {len(runs)}, "
+            f"{world:16} {'ids' if ids else 'no ids':6} found {sum(found for found, *_ in runs)} of {len(runs)}, "
             f"after {np.median(lasts):.1f} s, at most {max(lasts):.1f} s; "
             f"false alarms {sum(len(c) for _, _, c, _ in runs)}; "
             f"maps with something twice {sum(twice > 0 for *_, twice in runs)}",

@@ -116,6 +116,16 @@ def test_beacons_above_the_plane_of_their_robot_are_named_with_their_height(tmp_
     assert heights["-2"].cure == "--set robots.rover.sensors.radio.mount.z_m=-2"
 
 
+def test_ranges_that_are_too_long_are_named_and_no_height_of_their_beacons() -> None:
+    radio = "robots.rover.sensors={radio: {type: range, sigma_range_m: 0.05, range_max_m: 30}}"
+    log = log_of(measuring(lambda y: y + 2.0), (*CORNERS, radio))
+    run = run_of(log, (*CORNERS, radio))
+    mistake, _ = gross(run, log) or (None, None)
+    assert mistake is not None
+    assert (mistake.name, mistake.of, mistake.value) == ("range_offset", ("rover", "radio", "range_m"), 2.0)
+    assert mistake.cure == "--set robots.rover.sensors.radio.bias_m=2"
+
+
 def test_many_sizes_of_one_mistake_leave_room_for_others() -> None:
     """A robot that drives straight at first shows little of clockwise bearings."""
     sizes = [Mistake("time_offset", "", "", {}, gain=k, value=0.1 * k) for k in range(8)]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.diagnosis.mistakes import LATE, Mistake, late_scans, mistakes, with_value
+from kalmark.diagnosis.mistakes import Mistake, late_scans, mistakes, with_value
 from kalmark.diagnosis.single_ids import OUTLIERS, Filtered, find_wrong_ids, gated
 from kalmark.diagnosis.trials import (
     FITS,
@@ -90,8 +90,8 @@ def likeliest(
     every = Trials(log, events, config)
     tried = track(as_likely_as_a_few_kinds(changes), "the likeliest mistakes, one after the other", show=progress)
     made = [one for change in tried for one in every.explain(change)]
-    late = max((one for one in made if one.name == LATE), key=lambda one: one.gain, default=None)
-    made = [one for one in made if one.name != LATE or one is late]
+    sizes = {(one.name, one.of): one for one in sorted(made, key=lambda one: one.gain)}  # the likeliest of each error
+    made = [one for one in made if not one.of or one is sizes[one.name, one.of]]
     off = [*every.explain(Mistake(OUTLIERS, "", "", gated(config)))] if made else []
     return first_of([one for one in made if all(one.gain > other.gain for other in off)])
 

@@ -14,13 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.diagnosis.cause_texts import log_correction_line
+from kalmark.diagnosis.cause_texts import RANGE, log_correction_line
+from kalmark.diagnosis.error_columns import ALL
 from kalmark.events import Control, Event, Scan
 from kalmark.results.figure_texts import figure
 from kalmark.results.run import Run
 from kalmark.slam.robot import Robot
 
 TURNS_DEG = (180, 90, -90)
+OFFSETS_M = (-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0)  # of ranges
 HEIGHTS_M = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0)  # of beacons above a robot of the plane, or below it
 DEGREE = math.pi / 180
 LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048}
@@ -41,7 +43,8 @@ class Mistake(NamedTuple):
     `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
     `since_s` since when it counts, in s of the log.  `shrunk` has the sensors
     of which a measurement is smaller without it, and the logarithm of by how much: its noise then explains more.
-    `value` is its size, if it has one.
+    A size of a small error, which needs no such search where it is small, has `value` in `unit` and is `of` what the
+    error is (`causes.Finding`).
     """
 
     name: str
@@ -52,7 +55,9 @@ class Mistake(NamedTuple):
     gain: float = 0.0
     since_s: float = 0.0
     shrunk: Mapping[Where, float] = {}
+    of: tuple[str, ...] = ()
     value: float = 0.0
+    unit: str = ""
 
 
 def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
@@ -67,7 +72,7 @@ def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
         yield from _of_columns(config, sensors)
     for robot in robots.values():
         yield from _of_mounts(config, robot)
-        yield from _of_heights(config, robot)
+        yield from _of_ranges(config, robot)
     for robot in robots.values():
         yield from _of_controls(config, robot)
     if any(column.endswith("ps") for robot in robots.values() for column in robot.motion.columns):
@@ -141,16 +146,21 @@ def _of_mounts(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
             yield from (_turned(config, robot.name, sensors, turn, space) for turn in TURNS_DEG)
 
 
-def _of_heights(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
-    """Yield that what a sensor of the plane measures the range of is at another height."""
-    for sensor in (name for name, mount in robot.sensors.items() if tuple(mount.sensor.columns) == ("range_m",)):
-        path = ("robots", robot_section(config, robot.name), "sensors", sensor, "mount", "z_m")
+def _of_ranges(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
+    """Yield that ranges alone are off by a constant, or, in the plane, of things at another height."""
+    for sensor in (name for name, mount in robot.sensors.items() if tuple(mount.sensor.columns) == (RANGE,)):
+        path, of = ("robots", robot_section(config, robot.name), "sensors", sensor), f"{robot.name}.{sensor}"
+        bias_m = float(configured_value(config, (*path, "bias_m")) or 0.0)
+        for offset_m in OFFSETS_M:
+            evidence = f"ranges of {of} are {abs(offset_m):g} m too {'long' if offset_m > 0 else 'short'}"
+            cure = f"--set robots.{of.replace('.', '.sensors.')}.bias_m={bias_m + offset_m:g}"
+            changed = with_value(config, (*path, "bias_m"), bias_m + offset_m)
+            error = (robot.name, sensor, RANGE)
+            yield Mistake("range_offset", evidence, cure, changed, of=error, value=offset_m, unit="m")
         for height_m in HEIGHTS_M if robot.motion.space.axes == 1 else ():
-            evidence = (
-                f"ranges of {robot.name}.{sensor} fit only if they are of things {height_m:g} m above or below it"
-            )
-            cure = f"--set robots.{robot.name}.sensors.{sensor}.mount.z_m={-height_m:g}"
-            yield Mistake("height", evidence, cure, with_value(config, path, -height_m))
+            evidence = f"ranges of {of} fit only if they are of things {height_m:g} m above or below it"
+            cure = f"--set robots.{of.replace('.', '.sensors.')}.mount.z_m={-height_m:g}"
+            yield Mistake("height", evidence, cure, with_value(config, (*path, "mount", "z_m"), -height_m))
 
 
 def _turned(config: Mapping[str, Any], robot: str, sensors: list[str], turn: int, space: bool) -> Mistake:
@@ -200,7 +210,8 @@ def late_scans(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
     by_ns = round(by_s * 1e9)
     return Mistake(
         LATE, evidence, cure, config,
-        lambda e: replace(e, t_ns=e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e, value=by_s,
+        lambda e: replace(e, t_ns=e.t_ns + by_ns) if isinstance(e, Scan) and e.robot == robot else e,
+        of=(robot, ALL), value=by_s, unit="s",
     )  # fmt: skip
 
 

@@ -21,7 +21,6 @@ from kalmark.diagnosis.blind import blind
 from kalmark.diagnosis.cause_search import Search, joined
 from kalmark.diagnosis.cause_texts import finding_text, odd_control_text
 from kalmark.diagnosis.causes import JUMPS, LEAST_GAIN, TIMES, Finding
-from kalmark.diagnosis.error_columns import ALL
 from kalmark.diagnosis.gross_mistakes import gross, started_at
 from kalmark.diagnosis.jumps import LISTED, Controls, merge_jumps
 from kalmark.diagnosis.linear import Linear
@@ -164,11 +163,9 @@ def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
         return _with_cure(run, log, _judged(run, log, first, most, progress), alarmed, most, progress)
     mistake, without = found
     cause = _of_mistake(mistake)
-    if mistake.name == LATE:
-        late = Finding(
-            LATE, (mistake.cure.split(".")[2].split("=")[0], ALL), mistake.gain, 0.0, mistake.value, unit="s"
-        )
-        return _with_cure(run, log, _judged(run, log, first, most, progress), alarmed, most, progress, late)
+    if mistake.of:
+        error = Finding(mistake.name, mistake.of, mistake.gain, 0.0, mistake.value, unit=mistake.unit)
+        return _with_cure(run, log, _judged(run, log, first, most, progress), alarmed, most, progress, error)
     if without is None:
         return Verdict(WRONG, (cause, *(c for c in first if c.name in (COPIES, "gap") or c in off)), AGAIN)
     verdict = _judged(run, log, first, most, progress)
