@@ -112,7 +112,7 @@ def test_a_miss_where_little_is_seen_counts_little() -> None:
         looks.count(far, np.array([k % 10 == 0]))
     w_near, w_far = looks.weights(near)[0], looks.weights(far)[0]
     assert w_near > 5 * w_far
-    assert looks.weights(near).shape == (1,) and looks.table.shape == (CELLS,)
+    assert looks.weights(near).shape == (1,) and looks.table.shape == CELLS
 
 
 def test_a_table_of_landmarks_has_the_marks_and_a_known_map_leaves_them_out(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from kalmark.errors import MapError
-from kalmark.tracks.looks import AGAIN, BEARINGS, CELLS, MOST, RANGES, STANDING, Looks, cells_of
+from kalmark.tracks.looks import AGAIN, MOST, RANGES, STANDING, Looks, cells_of
 
 POSE = np.array([1.0, 2.0, 3.1])
 LEVEL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
@@ -53,35 +53,47 @@ def test_cells_are_four_to_an_octave_of_ranges_and_15_deg_of_bearings() -> None:
     r = np.array([1.0, 2.0**0.26, 2.0, 1e-9, 1e30])
     np.testing.assert_array_equal(cells_of(r, np.zeros(5), np.zeros(5, bool))[:, 0], [32, 33, 36, 0, RANGES - 1])
     bearing = np.radians([-180.0, -164.0, 0.0, 16.0, 180.0])
-    np.testing.assert_array_equal(
-        cells_of(np.ones(5), bearing, np.zeros(5, bool))[:, 1], RANGES + np.array([0, 1, 12, 13, 0])
-    )
+    np.testing.assert_array_equal(cells_of(np.ones(5), bearing, np.zeros(5, bool))[:, 1], [0, 1, 12, 13, 0])
     hidden = cells_of(np.ones(2), np.zeros(2), np.array([False, True]))[:, 2]
-    np.testing.assert_array_equal(hidden, RANGES + BEARINGS + np.array([0, 1]))
-    assert hidden[1] == CELLS - 1
+    np.testing.assert_array_equal(hidden, [0, 1])
+
+
+def looked_at(shares: list[tuple[float, float, bool, float]], number: int) -> tuple[Looks, np.ndarray]:
+    """Return looks at so many landmarks of each range, bearing, hidden or not, and share seen, and their cells."""
+    r, bearing, hidden, share = (np.array(column) for column in zip(*shares, strict=True))
+    cells, looks = cells_of(r, bearing, hidden.astype(bool)), Looks(taken=AGAIN)
+    for k in range(number):
+        looks.count(cells, k < number * share)
+    return looks, cells
+
+
+def test_the_detection_probability_is_a_product_of_what_ranges_bearings_and_hiding_things_leave() -> None:
+    """Half of what is in view is hidden, and behind the sensor nothing is seen, however near."""
+    places = [(r, b, h) for r in (3.0, 12.0) for b in (0.0, 3.0) for h in (False, True)]
+    shares = [(r, b, h, (0.8 if r < 5 else 0.2) * (1.0 if b < 1 else 0.0) * (0.5 if h else 1.0)) for r, b, h in places]
+    looks, cells = looked_at(shares, 1000)
+    p = looks.detection()[tuple(cells.T)]
+    np.testing.assert_allclose(p, [share for *_, share in shares], atol=0.01)
 
 
 def test_a_miss_counts_by_the_share_that_is_seen_there_against_where_most_is_seen() -> None:
-    """Eight of ten are seen at 3 m, one of ten at 12 m: p = 8.5 / 11 and 1.5 / 11, q the mean of what is seen."""
-    cells = cells_of(np.array([3.0, 12.0]), np.zeros(2), np.zeros(2, bool))
-    looks = Looks(taken=AGAIN)
-    for k in range(10):
-        looks.count(cells, np.array([k < 8, k < 1]))
-    near, far = 8.5 / 11, 1.5 / 11
-    q = (8 * near + 1 * far) / 9
-    expected = [1.0, math.log(1 - far) / math.log(1 - q)]  # at most as much as where most is seen
-    np.testing.assert_allclose(looks.weights(cells), expected)
+    looks, cells = looked_at([(3.0, 0.0, False, 0.8), (12.0, 0.0, False, 0.1)], 1000)
+    q = (0.8 * 0.8 + 0.1 * 0.1) / 0.9  # the mean of what is seen
+    expected = [1.0, math.log(1 - 0.1) / math.log(1 - q)]  # at most as much as where most is seen
+    np.testing.assert_allclose(looks.weights(cells), expected, rtol=0.01)
+    assert looks.log_miss == pytest.approx(math.log(1 - q), rel=0.01)
+    before = looks.weights(cells)
     looks.taken = AGAIN + 1
     looks.count(cells, np.array([True, True]))
-    np.testing.assert_allclose(looks.weights(cells), expected)  # they are estimated again after eight looks
+    np.testing.assert_array_equal(looks.weights(cells), before)  # they are estimated again after eight looks
 
 
 def test_what_is_seen_always_is_taken_to_be_seen_by_98_percent() -> None:
-    cells, looks = cells_of(np.array([3.0, 12.0]), np.zeros(2), np.zeros(2, bool)), Looks(taken=AGAIN)
-    for _ in range(1000):
-        looks.count(cells, np.array([True, False]))
-    weight = math.log(1 - 0.5 / 1001) / math.log(1 - MOST)
-    np.testing.assert_allclose(looks.weights(cells), [1.0, weight])
+    looks, cells = looked_at([(3.0, 0.0, False, 1.0), (12.0, 0.0, False, 0.0)], 1000)
+    near, far = looks.weights(cells)
+    assert near == pytest.approx(1.0)
+    assert looks.log_miss == pytest.approx(math.log(1 - MOST))
+    assert 0.0 < far < 0.001
 
 
 def test_without_anything_seen_a_miss_counts_in_full() -> None:

@@ -237,7 +237,7 @@ def log_misses(scan: ScanContext, of: Known, upkeep: Upkeep) -> dict[Id, float]:
     v = of.model.seen_from(pose, of.values[rows])[0]
     sure = _surely(scan.channel, v)
     r, bearing = np.sqrt((v[sure, : scan.dimensions] ** 2).sum(axis=1)), np.arctan2(v[sure, 1], v[sure, 0])
-    logs = looks.log_miss() * _weights(looks, upkeep, r, bearing, _hidden(scan, r, bearing))[0]
+    logs = looks.log_miss * _weights(looks, upkeep, r, bearing, _hidden(scan, r, bearing))[0]
     return dict(zip([of.names[row] for row in rows[sure].tolist()], logs.tolist(), strict=True))
 
 

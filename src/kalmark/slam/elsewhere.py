@@ -144,7 +144,7 @@ def _note(state: State, scan: ScanContext, of: Evidence, look: existence.Observe
     """Take note of the landmarks that a scan saw, missed and began."""
     made, t_ns = scan.report.observations, scan.event.t_ns
     if look is not None:
-        log_miss = scan.tracks.looks[scan.key].log_miss()
+        log_miss = scan.tracks.looks[scan.key].log_miss
         of.miss(look.missed, [weight * log_miss for weight in look.missed.values()], t_ns, state.is_surveyed)
     seen = [o for o in made if o.outcome == "associated" and (look is not None or o.id is not None)]
     if seen:

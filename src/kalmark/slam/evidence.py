@@ -22,7 +22,7 @@ import numpy as np
 from kalmark.association.global_start import SURE
 from kalmark.events import Id
 
-MOST, RECENT = 64, 256  # landmarks that were missed last, and seen last, which outweigh all older ones
+MOST, RECENT = 64, 256  # landmarks whose misses count most, and that were seen last, which outweigh all others
 NEVER_NS, MAPPED_NS = -1, 0  # when landmarks begin that were surveyed, and that were mapped before what is recorded
 
 
@@ -61,8 +61,8 @@ class Evidence:
         for name, log in zip(names, logs, strict=True):
             last = self.seen[name][1] if name in self.seen else NEVER_NS if surveyed(name) else MAPPED_NS
             self.missed.setdefault(name, (last, t_ns, max(float(log), -SURE)))
-        for name in [*self.missed][:-MOST]:
-            del self.missed[name]
+        most = sorted(reversed(self.missed), key=lambda name: self.missed[name][2])[:MOST]
+        self.missed = {name: told for name, told in self.missed.items() if name in most}
 
     def weigh(self, again: Mapping[Id, float] | None = None) -> None:
         """Find the onset of the least ratio.

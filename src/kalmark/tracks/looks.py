@@ -1,8 +1,9 @@
 """Detection probability of a sensor over its field of view, counted in scans from different poses (looks).
 
 A look is a scan from another pose than the last one, or after many from one pose: scans in a row miss a landmark for
-the same reason.  The detection probability depends on the range, the bearing and on objects that stand nearer; each is
-counted by itself, so that a chance where little is seen (beyond a detector's reach, behind a tree) counts for little.
+the same reason.  The detection probability is a product of three factors, by the range, by the bearing and by whether
+an object stands nearer, so that a chance where little is seen (beyond a detector's reach, behind it, behind a tree)
+counts for little.  Each factor is what is seen over what the other two expect there (Deming and Stephan 1940).
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from kalmark.errors import MapError
 
 MOVED, TURNED_RAD, STANDING = 0.1, 0.2, 20  # of the range; a turn; scans of a sensor that stands: another look
 PER_OCTAVE, NEAREST_LOG2, RANGES, BEARINGS = 4, 8, 80, 24  # of ranges, from 2^-8 m on; sectors of bearings
-AGAIN = 8  # looks until what a miss counts is estimated again
-CELLS = RANGES + BEARINGS + 2  # the last two: nothing stands nearer, something does
-PARTS = (slice(0, RANGES), slice(RANGES, RANGES + BEARINGS), slice(RANGES + BEARINGS, CELLS))
+AGAIN = 8  # looks until what a miss counts is estimated again, but for the first ones
+CELLS = RANGES, BEARINGS, 2  # the last ones: nothing stands nearer, something does
+ROUNDS = 4  # in which the factors of the detection probability are fitted
 MOST = 0.98  # of a detection probability
 
 
@@ -28,9 +29,10 @@ class Looks:
     """The last look of a sensor, and what was seen of what was expected in all of them.
 
     `pose` (3,) or (7,) is that of the sensor at the last look, `scale_m` how far it saw, `since` the scans since then
-    and `changes` the landmarks that had come or gone; so many looks were `taken`.  `counts` (2, CELLS) are the
-    landmarks seen and expected, by range, by bearing, and by whether something stands nearer, `table` (CELLS,) what a
-    miss counts there.
+    and `changes` the landmarks that had come or gone; so many looks were `taken`.  `counts` (2, *CELLS) are the
+    landmarks seen and expected, by range, by bearing, and by whether something stands nearer, `table` (*CELLS,) what a
+    miss counts there, and `log_miss` the log probability that a landmark is missed which stands where those are that
+    are seen.
     """
 
     pose: Array | None = None
@@ -38,8 +40,9 @@ class Looks:
     since: int = 0
     changes: int = -1
     taken: int = 0
-    counts: Array = field(default_factory=lambda: np.zeros((2, CELLS)))
+    counts: Array = field(default_factory=lambda: np.zeros((2, *CELLS)))
     table: Array = field(default_factory=lambda: np.ones(CELLS))
+    log_miss: float = math.log(0.5)
 
     def is_due(self, pose: Array, changes: int) -> bool:
         """Return whether a scan from this pose is another look; a landmark that came or went makes it one."""
@@ -63,35 +66,38 @@ class Looks:
 
         It is log(1 - p) / log(1 - q), p the detection probability there and q that of what is seen.
         """
-        if self.taken % AGAIN == 0:
-            self.table = np.concatenate([self._weights(part) for part in PARTS])
-        w: Array = self.table[cells].prod(axis=1)
-        return w
+        if (self.taken < AGAIN or self.taken % AGAIN == 0) and self.counts[0].any():
+            p = self.detection()
+            self.log_miss = math.log1p(-min(float((self.counts[0] * p).sum() / self.counts[0].sum()), MOST))
+            self.table = np.log1p(-np.minimum(p, -math.expm1(self.log_miss))) / self.log_miss
+        return np.asarray(self.table[tuple(cells.T)])
 
-    def _weights(self, part: slice) -> Array:
-        seen, expected = self.counts[:, part]
-        p = (seen + 0.5) / (expected + 1.0)
-        if not seen.any():
-            return np.ones(len(p))
-        log_miss = self.log_miss(part)
-        return np.asarray(np.log1p(-np.minimum(p, -math.expm1(log_miss))) / log_miss)
+    def detection(self) -> Array:
+        """Return the detection probability (*CELLS,): a factor by the range, one by the bearing, one by what is nearer.
 
-    def log_miss(self, part: slice = PARTS[0]) -> float:
-        """Return the log probability that a landmark is missed which stands where those are that are seen."""
-        seen, expected = self.counts[:, part]
-        p = (seen + 0.5) / (expected + 1.0)
-        return math.log1p(-min(float(seen @ p / seen.sum()), MOST)) if seen.any() else math.log(0.5)
+        Each is what is seen there over what the others expect.  Where nothing is known it is a half by the range, and
+        the others change nothing.
+        """
+        seen, expected = self.counts
+        r, b, h = (np.ones(n) for n in CELLS)
+        for _ in range(ROUNDS):
+            r = (seen.sum((1, 2)) + 0.5) / (expected @ h @ b + 1.0)
+            b = (seen.sum((0, 2)) + 0.5) / (r @ (expected @ h) + 0.5)
+            h = (seen.sum((0, 1)) + 0.5) / (b @ np.tensordot(r, expected, 1) + 0.5)
+        return np.minimum(r[:, None, None] * b[:, None] * h, MOST)
 
     def count(self, cells: Index, seen: Flags) -> None:
         """Count what was seen (K,) of what was expected in these cells (K, 3)."""
-        np.add.at(self.counts[1], cells.ravel(), 1.0)
-        np.add.at(self.counts[0], cells[seen].ravel(), 1.0)
+        np.add.at(self.counts[1], tuple(cells.T), 1.0)
+        np.add.at(self.counts[0], tuple(cells[seen].T), 1.0)
 
     def restored(self) -> None:
         """Check the arrays of a file.  Raises MapError."""
-        shapes = (self.counts.shape, self.table.shape) == ((2, CELLS), (CELLS,))
+        shapes = (self.counts.shape, self.table.shape) == ((2, *CELLS), CELLS)
         if not shapes or not (self.counts >= 0).all() or not (self.table >= 0).all():
-            raise MapError(f"the counts of looks are {self.counts.shape} and {self.table.shape}, expected {(2, CELLS)}")
+            raise MapError(
+                f"the counts of looks are {self.counts.shape} and {self.table.shape}, expected {(2, *CELLS)}"
+            )
 
 
 def cells_of(r: Array, bearing: Array, hidden: Flags) -> Index:
@@ -99,6 +105,6 @@ def cells_of(r: Array, bearing: Array, hidden: Flags) -> Index:
     cells = np.empty((len(r), 3), np.int64)
     octave = PER_OCTAVE * (np.log2(np.maximum(r, 2.0**-NEAREST_LOG2)) + NEAREST_LOG2)
     cells[:, 0] = np.minimum(octave, RANGES - 1)
-    cells[:, 1] = RANGES + (bearing / (2 * math.pi) + 0.5) * BEARINGS % BEARINGS
-    cells[:, 2] = RANGES + BEARINGS + hidden
+    cells[:, 1] = (bearing / (2 * math.pi) + 0.5) * BEARINGS % BEARINGS
+    cells[:, 2] = hidden
     return cells
