@@ -14,6 +14,7 @@ from kalmark.config import build_slam
 from kalmark.events import Event
 from kalmark.geometry import compose, inverse
 from kalmark.geometry.angles import wrap
+from kalmark.results.batch import batch_input
 from kalmark.simulate import load_world, simulate
 
 RANGE_M, RATE_HZ = 8.0, 5.0
@@ -118,6 +119,18 @@ def test_a_robot_that_is_not_stays_where_it_is(ids: bool, seed: int) -> None:
     off, carried = errors(slam_at(poses[0], ids), log_of(poses, places, seed, ids), poses[1:])
     assert not carried
     assert off.max() < 0.8
+
+
+def test_a_batch_solution_has_no_observation_of_a_robot_that_was_elsewhere_nor_of_the_scan_that_placed_it() -> None:
+    places, events, _ = carried_log(2, ids=False)
+    slam = slam_at(path(1)[0], ids=False)
+    for name, place in enumerate(places):
+        slam.add_landmark(name, place)
+    run = km.record(slam, events, progress=False)
+    (gap,) = run.history.carried()
+    used = run.history.t_ns[batch_input(run).associations.scan]
+    assert not ((gap.start_ns <= used) & (used <= gap.end_ns)).any()
+    assert used.min() < gap.start_ns < gap.end_ns < used.max()
 
 
 def test_trees_that_were_felled_do_not_carry_a_robot() -> None:
