@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from kalmark.cli.app import main
-from kalmark.diagnosis.trials import options_of
+from kalmark.diagnosis.trials import is_configured, options_of
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,20 @@ def test_a_map_without_a_cause_has_nothing_to_cure(
 )
 def test_options_of_a_cure(cure: str, options: list[str]) -> None:
     assert options_of(cure) == options
+
+
+@pytest.mark.parametrize(
+    ("cure", "expected"),
+    [
+        ("--set upkeep.repeats=merge", True),
+        ("--set upkeep.repeats=off", False),
+        ("--set robots.car.gaps=widen", True),
+        ("--set robots.car.gaps=widen --set upkeep.repeats=warn", False),
+        ("look at the log", False),
+    ],
+)
+def test_a_cure_that_is_configured_is_none(cure: str, expected: bool) -> None:
+    assert is_configured({"robots": {"each": {"gaps": "widen"}}, "upkeep": {"repeats": "merge"}}, cure) is expected
 
 
 def test_an_interrupted_verdict_loses_nothing_of_a_run(

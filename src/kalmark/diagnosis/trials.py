@@ -224,6 +224,15 @@ def options_of(cure: str) -> list[str]:
     return words[1::2] if {*words[::2]} <= {"--set"} else []
 
 
+def is_configured(config: Mapping[str, Any], cure: str) -> bool:
+    """Return whether a configuration has the values that a cure sets: it cures nothing."""
+    options = [option.partition("=") for option in options_of(cure)]
+    paths = [path.split(".") for path, _, _ in options]
+    at = [(names[0], robot_section(config, names[1]), *names[2:]) if names[0] == "robots" else names for names in paths]
+    now = [configured_value(config, tuple(names)) for names in at]
+    return bool(now) and now == [parse_value(text, "cure") for _, _, text in options]
+
+
 def _nested(names: Sequence[str], value: float) -> dict[str, Any]:
     return {names[0]: _nested(names[1:], value) if len(names) > 1 else value}
 

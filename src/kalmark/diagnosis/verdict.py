@@ -29,7 +29,17 @@ from kalmark.diagnosis.mistakes import LATE, Mistake
 from kalmark.diagnosis.onsets import without_onset
 from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
 from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
-from kalmark.diagnosis.trials import AT_ONCE, FITS, LOST, MOST, filter_events, fit_of_run, likelihood_gain, with_cure
+from kalmark.diagnosis.trials import (
+    AT_ONCE,
+    FITS,
+    LOST,
+    MOST,
+    filter_events,
+    fit_of_run,
+    is_configured,
+    likelihood_gain,
+    with_cure,
+)
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
@@ -142,7 +152,9 @@ def diagnose(run: Run, most: int = AT_ONCE, *, progress: bool = False) -> Verdic
     """
     run.run_plugins()
     seen, log = blind(run)
-    verdict = _with_signs(seen, _of_causes(seen, log, most, progress))
+    found = _of_causes(seen, log, most, progress)
+    causes = [replace(cause, cure="") if is_configured(run.config, cause.cure) else cause for cause in found.causes]
+    verdict = _with_signs(seen, replace(found, causes=tuple(causes)))
     if not run.summary:
         run.evaluate()
     summary = run.summary
