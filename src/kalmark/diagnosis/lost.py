@@ -15,8 +15,8 @@ from kalmark.results.checked import DOUBTFUL, UNCHECKED, Sign
 from kalmark.results.control_gaps import KNOWN
 from kalmark.results.figure_texts import figure
 from kalmark.results.run import Run
-from kalmark.slam.alternative import LASTS_S
-from kalmark.slam.replacing import NEEDED
+from kalmark.slam.pose_hypothesis import LASTS_S
+from kalmark.slam.relocation_by_fixes import NEEDED
 
 
 class Lost(NamedTuple):

@@ -56,7 +56,7 @@ from kalmark.results.verdict_text import INNOVATIONS, NO_BATCH, NO_LANDMARKS, NO
 from kalmark.results.warnings import NO_ID, TOO_SMALL, placements, signs, window_warnings, words_of
 from kalmark.results.wrong_starts import restarts
 from kalmark.slam.elsewhere import ODDS
-from kalmark.slam.replacing import NEEDED
+from kalmark.slam.relocation_by_fixes import NEEDED
 from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 

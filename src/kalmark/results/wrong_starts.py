@@ -9,7 +9,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.results.history import History
 from kalmark.results.measures import Rigid, level
-from kalmark.slam.replacing import NEEDED
+from kalmark.slam.relocation_by_fixes import NEEDED
 
 
 class Restart(NamedTuple):
@@ -27,7 +27,7 @@ class Restart(NamedTuple):
 
 
 def restarts(history: History) -> dict[str, Restart]:
-    """Return the robots that too few fixes fitted before the map was moved onto the others (`slam/replacing.py`)."""
+    """Return robots whose map too few fixes fitted before it was moved onto others (`slam/relocation_by_fixes.py`)."""
     found: dict[str, Restart] = {}
     for robot in () if len(history.robots) > 1 else history.robots:
         mine = [fix for fix in history.fixes if fix.robot == robot]

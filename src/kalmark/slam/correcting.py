@@ -22,7 +22,7 @@ from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
-from kalmark.tracks.surveys import SURVEYED
+from kalmark.tracks.survey_checks import SURVEYED
 
 
 def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[ObservationModel, list[int]]],

@@ -3,8 +3,8 @@
 A covariance does not show that a robot was carried away.  The log does (`evidence.py`).  From - `SURE` on a pose is
 searched for at which the scan, and what was mapped since the onset, is that of old landmarks: by a tag, by points or
 rays with ids, or by distances (`association/global_start.py`).  A second filter of the robot alone begins there, an
-`Alternative`, on the old map as it is, with the same ratio.  Where both differ by log `ODDS` the robot is placed there;
-what was mapped meanwhile goes.
+`PoseHypothesis`, on the old map as it is, with the same ratio.  Where both differ by log `ODDS` the robot is placed
+there; what was mapped meanwhile goes.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import Space
 from kalmark.management import existence
 from kalmark.report import ELSEWHERE, Gap
-from kalmark.slam.alternative import Alternative, write_robot
 from kalmark.slam.evidence import Evidence
+from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
 from kalmark.slam.state import State
 from kalmark.tracks.channel import EUCLIDEAN
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import ScanContext
-from kalmark.tracks.surveys import SURVEYED
+from kalmark.tracks.survey_checks import SURVEYED
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
 WIDER = 3.0  # times its sigmas by which an overconfident filter may be off
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
-HELD = 2  # scans of several landmarks that are held back without an alternative
+HELD = 2  # scans of several landmarks that are held back without a second hypothesis
 MOST = 48  # landmarks of a constellation
 MEANWHILE = "mapped while its robot was elsewhere"
 
@@ -130,13 +130,13 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
         del state.evidence[robot]
     if of.ratio <= -SURE:
         old, is_look = _old(state, scan, of), look is not None or scan.adrift or all_named
-        is_tried = of.fitted and robot in state.alternatives
+        is_tried = of.fitted and robot in state.pose_hypotheses
         if is_look and not is_tried:
             _propose(state, scan, of, old)
-        if of.fitted and robot in state.alternatives and (is_tried or all_named):
+        if of.fitted and robot in state.pose_hypotheses and (is_tried or all_named):
             _try(state, scan, of, old)
     elif of.fitted:
-        state.alternatives.pop(robot, None)
+        state.pose_hypotheses.pop(robot, None)
         of.fitted = set()
 
 
@@ -219,11 +219,13 @@ def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Propos
 
 
 def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
-    """Begin an alternative where a constellation is one of old landmarks."""
+    """Begin a second hypothesis where a constellation is one of old landmarks."""
     found, name, r = _locate(state, scan, of, old), scan.event.robot, state.map.mean(scan.robot)
     if found is None:
         return
-    other = state.alternatives[name] = Alternative.of(state.map, state.moving[name], state.blocks, scan.event.t_ns)
+    other = state.pose_hypotheses[name] = PoseHypothesis.of(
+        state.map, state.moving[name], state.blocks, scan.event.t_ns
+    )
     of_world = FRAMES[len(scan.channel.at)]
     to_robot = of_world.compose(of_world.inverse(scan.pose())[0], r[: len(found.T)])[0]
     write_robot(other.map, scan.robot, of_world.compose(found.T, to_robot)[0], found.cov)
@@ -243,12 +245,12 @@ def _pair(scan: ScanContext, places: Array | None, old: Known) -> dict[int, int]
 
 
 def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
-    """Correct an alternative by a scan; place the robot there if it is certain, and forget it if it does not fit.
+    """Correct a second hypothesis by a scan; place the robot there if it is certain, and forget it if it does not fit.
 
     The constellation has to be one of old landmarks there, and nowhere else, still.
     """
     robot, channel = scan.event.robot, scan.channel
-    other, model = state.alternatives[robot], channel.models[old.model.kind]
+    other, model = state.pose_hypotheses[robot], channel.models[old.model.kind]
     view, places = replace(scan, map=other.map), channel.places(other.map, scan.robot, scan.y)
     pairs = _pair(scan, places, old) if len(old.names) else {}
     logs, fits = dict[Id, float](), dict[Id, int]()
@@ -269,15 +271,15 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         if None not in scan.ids or (again and is_same_pose(again.T, channel.pose(other.map, scan.robot))):
             _place(state, scan, of, other, [*fits])
     elif of.gain <= -SURE:
-        del state.alternatives[robot]
+        del state.pose_hypotheses[robot]
         of.fitted, of.gain = set(), 0.0
 
 
-def _place(state: State, scan: ScanContext, of: Evidence, other: Alternative, fits: Sequence[Id]) -> None:
-    """Move a robot to where its alternative is; what was mapped while it was elsewhere goes.
+def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis, fits: Sequence[Id]) -> None:
+    """Move a robot to where its second hypothesis is; what was mapped while it was elsewhere goes.
 
-    Its error is that of the alternative, and that of the map there, which the alternative does not have: of the pose of
-    which the landmarks l that it sees are least squares, d r = (sum A'A)^-1 sum A' d l, A = d l / d r.
+    Its error is that of the second hypothesis, and that of the map there, which the second hypothesis does not have: of
+    the pose of which the landmarks l that it sees are least squares, d r = (sum A'A)^-1 sum A' d l, A = d l / d r.
     """
     robot, slot, tracks = scan.event.robot, scan.robot, state.tracks
     before, after, cov = state.map.mean(slot), other.map.mean(slot), other.map.covariance([slot])
@@ -305,7 +307,7 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: Alternative, fi
         del tracks.tentative[track.id]
     state.clones.forget_current(robot)
     state.moving[robot].left_out.clear()
-    for others in (state.alternatives, state.sums, state.evidence):
+    for others in (state.pose_hypotheses, state.sums, state.evidence):
         others.pop(robot, None)
     if not scan.adrift:  # else the gap since which it is has been reported
         turned = (

@@ -31,9 +31,9 @@ class Evidence:
     """Landmarks `seen`, with when they were begun, when seen last, and the log, and those `missed` since.
 
     Of these it is when they were seen last, since when they are missed, and the log.  `ratio` is the least one, of an
-    onset at `since_ns`, `gain` that of the robot's alternative, in which the landmarks `fitted` have counted.  `far`
-    are the places (x, y, sigma), in space with z, of observations with ids elsewhere, as the filter has them, and so
-    many scans of these were `held` back.
+    onset at `since_ns`, `gain` that of the robot's second hypothesis, in which the landmarks `fitted` have counted.
+    `far` are the places (x, y, sigma), in space with z, of observations with ids elsewhere, as the filter has them, and
+    so many scans of these were `held` back.
     """
 
     seen: dict[Id, tuple[int, int, float]] = field(default_factory=dict)

@@ -9,7 +9,7 @@ axis that bends, each part is corrected alone, and its likelihood is its weight:
 
 A part that does not explain an observation keeps the likelihood of an outlier.  Beside the parts stands the prior,
 which is moved and not corrected, and under which an observation may be any.  Once it is likelier than all parts, which
-began at an outlier, then others begin from it.  Each part is a filter of the robot alone, an `Alternative`.
+began at an outlier, then others begin from it.  Each part is a filter of the robot alone, a `PoseHypothesis`.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from kalmark.geometry.angles import rotation, wrap
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import ANGLE, HEADING
 from kalmark.models.observe import linearize
-from kalmark.slam.alternative import Alternative, write_robot
 from kalmark.slam.held_control import MotionPart, Moving
+from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
 from kalmark.tracks.linearity import SIGMAS, TURN_RAD, bends, turn_pose
-from kalmark.tracks.surveys import SURVEYED
+from kalmark.tracks.survey_checks import SURVEYED
 
 PIECES, PIECE_RAD = 12, 0.3  # of a circle of headings, and the sigma of each: they overlap to a sum that is even
 OVERLAP = 1.75  # sigmas of a piece from one to the next, as there
@@ -106,7 +106,7 @@ class GaussianSum:
     shows the moments of the sum.  Over these the last `linear` observations were as good as linear.
     """
 
-    prior: Alternative
+    prior: PoseHypothesis
     parts: Parts
     prior_log: float
     lead: float = -math.inf
@@ -115,13 +115,13 @@ class GaussianSum:
     @classmethod
     def of(cls, map_: Map, moving: Moving, blocks: int, t_ns: int, gate: float) -> GaussianSum:
         """Return the Gaussian of a robot in a map with so many blocks that are no landmarks, as one part."""
-        prior = Alternative.of(map_, moving, blocks, t_ns)
+        prior = PoseHypothesis.of(map_, moving, blocks, t_ns)
         return cls(prior, as_part(prior.map, 0.0), -0.25 * gate)
 
     @classmethod
     def anywhere(cls, map_: Map, moving: Moving, blocks: int, t_ns: int, gate: float) -> GaussianSum:
         """Return the sum of a robot that may be elsewhere than the map has it: without a part yet, and unlikely."""
-        prior = Alternative.of(map_, moving, blocks, t_ns)
+        prior = PoseHypothesis.of(map_, moving, blocks, t_ns)
         pose, sigmas = prior.map.mean(moving.slot)[:3], np.array([ANYWHERE_M, ANYWHERE_M, VAGUE_RAD])
         write_robot(prior.map, moving.slot, pose, np.diag(sigmas**2))
         return cls(prior, as_part(prior.map, 0.0).take(slice(0)), 0.0, 0.5 * IN_A_ROW * gate)
@@ -148,11 +148,11 @@ class GaussianSum:
         first = int(self.prior.map.rows(self.prior.moving.slot)[0])
         return slice(first, first + 3)
 
-    def all(self) -> list[Alternative]:
+    def all(self) -> list[PoseHypothesis]:
         """Return the prior and the parts."""
         return [self.prior, *self._filters(self.parts)]
 
-    def _filters(self, parts: Parts) -> list[Alternative]:
+    def _filters(self, parts: Parts) -> list[PoseHypothesis]:
         """Return filters that move and correct the numbers of parts."""
         return [
             replace(self.prior, map=cast(StochasticMap, self.prior.map).with_numbers(*part))

@@ -38,7 +38,7 @@ from kalmark.models.protocols import (
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
 from kalmark.slam.past_motion import PastMotion
-from kalmark.slam.replacing import RejectedFix
+from kalmark.slam.relocation_by_fixes import RejectedFix
 
 NO_NOISE = np.zeros((0, 0))
 MOST, CHANGED = 30, 4.0  # controls in their mean, and sigmas by which noise alone moves hardly any

@@ -27,7 +27,6 @@ from kalmark.geometry.gaussian import gate
 from kalmark.models.observe import linearize
 from kalmark.models.protocols import distances_alone, place_of
 from kalmark.report import JudgedScan, Observation
-from kalmark.slam.alternative import write_robot
 from kalmark.slam.gaussian_sum import (
     IN_A_ROW,
     NOWHERE,
@@ -35,11 +34,12 @@ from kalmark.slam.gaussian_sum import (
     KnownObservation,
     log_likelihood,
 )
+from kalmark.slam.pose_hypothesis import write_robot
 from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.linearity import bends, turn_holds
 from kalmark.tracks.scan import ScanContext
-from kalmark.tracks.surveys import SURVEYED
+from kalmark.tracks.survey_checks import SURVEYED
 
 UNNAMED = "the pose of its robot is not known yet, and it has no id of a known landmark"
 ONE = "from an unknown place it takes two known landmarks, expected a second one or a start with a smaller sigma_xy_m"
@@ -139,7 +139,7 @@ def _place(state: State, name: Any) -> Array:
     return known.mean(name) if name in known else state.map.mean(state.tracks.slot(name))
 
 
-def compare_alternatives(state: State, scan: ScanContext, judged: Sequence[JudgedScan]) -> None:
+def compare_hypotheses(state: State, scan: ScanContext, judged: Sequence[JudgedScan]) -> None:
     """Compare the filter of a robot with the sum of where else it may be, by what both expected of a scan."""
     sum_ = state.sums.get(scan.event.robot)
     if sum_ is None or not can_be_summed(scan.channel) or not judged:

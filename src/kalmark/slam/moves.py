@@ -66,8 +66,8 @@ def move(state: State, name: str, part: MotionPart) -> None:
     for key, given in state.given.items():
         if key[0] == name:
             given.add_motion(part)
-    if name in state.alternatives and not state.alternatives[name].move(state.estimator, part):
-        del state.alternatives[name]
+    if name in state.pose_hypotheses and not state.pose_hypotheses[name].move(state.estimator, part):
+        del state.pose_hypotheses[name]
     if name in state.sums and not state.sums[name].move(state.estimator, part):
         del state.sums[name]
     state.clones.forget_current(name)

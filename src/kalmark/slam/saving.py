@@ -29,10 +29,10 @@ from kalmark.filter.maps import restore_map as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
-from kalmark.slam.alternative import motion_of_alternative
 from kalmark.slam.description import Description, describe, describe_model
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.held_control import bias_block, bias_name
+from kalmark.slam.pose_hypothesis import motion_of_hypothesis
 from kalmark.slam.reader import StateReader
 from kalmark.slam.robot import Robot, mount_name
 from kalmark.slam.state import State
@@ -106,8 +106,8 @@ def fill_state(state: State, members: dict[str, bytes], landmarks: Landmark | No
         if not -1 <= track.slot < slots:
             raise MapError(f"slot of {track.id!r} is {track.slot}, expected one of {slots}")
     tracks.number()
-    for name, other in [*state.alternatives.items(), *((name, of.prior) for name, of in state.sums.items())]:
-        other.moving = motion_of_alternative(state.moving[name])
+    for name, other in [*state.pose_hypotheses.items(), *((name, of.prior) for name, of in state.sums.items())]:
+        other.moving = motion_of_hypothesis(state.moving[name])
     carried: dict[ChannelKey, Channel | StateReader] = {**state.channels, **state.readers}
     for key, channel in carried.items():
         channel.mount = tracks.slots.get(mount_name(*key), -1)

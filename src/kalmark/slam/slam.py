@@ -64,7 +64,7 @@ from kalmark.slam.estimate import Estimate
 from kalmark.slam.factors import correct_by_factor, factor_of
 from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy, refuse_other_world
-from kalmark.slam.replacing import NEEDED
+from kalmark.slam.relocation_by_fixes import NEEDED
 from kalmark.slam.robot import Robot, robots_given
 from kalmark.slam.sources import BufferedScans, RawDetector, Source
 from kalmark.slam.starting import SINGULAR
@@ -346,7 +346,7 @@ class Slam(Estimate):
         judged, found = correct(state, scan, policy, groups, decisions)
         judged = exact + judged
         if state.sums:
-            locating.compare_alternatives(state, scan, judged)
+            locating.compare_hypotheses(state, scan, judged)
         if again:
             found = found + starting.restart(state, scan, again, decisions)
         if not found and not policy.reviews and sum(len(group.rows) for group in judged) == len(decisions):

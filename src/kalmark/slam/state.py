@@ -17,7 +17,6 @@ from kalmark.filter.maps import MOST, CostBalance, compress_map, new_map
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
-from kalmark.slam.alternative import Alternative
 from kalmark.slam.checks import fault_of
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
@@ -25,6 +24,7 @@ from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import SELDOM, LastMeasurement
 from kalmark.slam.past_motion import PastMotion
 from kalmark.slam.policy import Policy, channel_of, kinds_of, landmark_of, policy_of, refuse_other_world
+from kalmark.slam.pose_hypothesis import PoseHypothesis
 from kalmark.slam.reader import LEAST_S, StateReader
 from kalmark.slam.rests import rest_detector
 from kalmark.slam.robot import Robot, mount_name
@@ -32,7 +32,7 @@ from kalmark.slam.sources import FilterView, SearchingDetector, Source
 from kalmark.tracks.channel import Channel, Parts
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.scan import Start
-from kalmark.tracks.surveys import Surveys
+from kalmark.tracks.survey_checks import Surveys
 from kalmark.tracks.track import ChannelKey, Tracks
 
 CURE = "start again from a pose that is less certain, or with larger sigmas of controls and sensors"
@@ -56,7 +56,7 @@ class State:
     """The map, the tracks and the clones of some robots, with the channels and readers of their sensors.
 
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
-    `standing` are, of robots with detection of rest, the names of the sensors that do; `alternatives` are, of robots
+    `standing` are, of robots with detection of rest, the names of the sensors that do; `pose_hypotheses` are, of robots
     whose readings do not fit, the other explanations of these; `sums` are, of robots that may be in several places,
     their poses; `evidence` is that robots are elsewhere; `taken` are the events of this very time: the kind, the robot
     and the sensor of each; `given` is what each sensor gave last; `balance` decides whether a dense map is compressed.
@@ -73,7 +73,7 @@ class State:
     given: dict[ChannelKey, LastMeasurement]
     placed: int  # fixes that have determined where the map is in the world; a survey counts as many
     moving: dict[str, Moving]
-    alternatives: dict[str, Alternative]
+    pose_hypotheses: dict[str, PoseHypothesis]
     sums: dict[str, GaussianSum]
     evidence: dict[str, Evidence]
     sources: dict[ChannelKey, Source]
@@ -82,7 +82,7 @@ class State:
     def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
         self.settings, self.robots, self.t_ns, self.taken, self.placed = settings, robots, None, set(), 0
         self.map, self.balance, self.tracks = new_map(settings.map, settings.numbers), CostBalance(), Tracks(robots)
-        self.clones, self.surveys, self.given, self.alternatives, self.sums = Clones(), Surveys(), {}, {}, {}
+        self.clones, self.surveys, self.given, self.pose_hypotheses, self.sums = Clones(), Surveys(), {}, {}, {}
         self.evidence = {}
         self.moving, self.sources, self.readers = {}, {}, {}
         self.channels: dict[ChannelKey, Channel] = {}

@@ -15,10 +15,10 @@ from kalmark.geometry.spaces import SE2, SE3, Space
 from kalmark.models.observe import view_of
 from kalmark.models.sensors import Gps2D, Gps3D
 from kalmark.report import JudgedScan, Observation, Report, outcomes_of
-from kalmark.slam import moves, replacing
-from kalmark.slam.alternative import Alternative, write_robot
+from kalmark.slam import moves, relocation_by_fixes
 from kalmark.slam.checks import refuse_bad_fix
 from kalmark.slam.held_readings import record_repeated_reading
+from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
 from kalmark.slam.reader import StateReader
 from kalmark.slam.state import State
 
@@ -36,7 +36,7 @@ def correct_by_reading(state: State, event: Scan, reader: StateReader) -> Report
         return report
     if not reader.counts and state.repeats(key, event.t_ns, event.y):
         return record_repeated_reading(report, [None] * len(event.y), R.shape[1], event.robot)
-    other = state.alternatives.get(event.robot)
+    other = state.pose_hypotheses.get(event.robot)
     sum_ = state.sums.get(event.robot)
     others = [*([] if other is None else [other]), *([] if sum_ is None else sum_.all())]
     reader.drift(event.t_ns, state.map, *(each.map for each in others))
@@ -102,7 +102,7 @@ def fix(state: State, event: Fix) -> Report:
         return record_repeated_reading(report, [event.robot], size, event.robot)
     gate, R = state.settings.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
     update = Update(view_of(ANTENNAS[size], None, ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
-    estimator, other = state.estimator.for_fixes(), state.alternatives.get(event.robot)
+    estimator, other = state.estimator.for_fixes(), state.pose_hypotheses.get(event.robot)
     fits = other is not None and other.correct(estimator, update)
     if event.robot in state.sums:
         state.sums[event.robot].correct(estimator, update)
@@ -117,23 +117,25 @@ def _record_position(state: State, name: str, y: Array, R: Array, done: Correcti
     """Take note whether a position y (d,) of noise R (d, d) fitted; return how far, m, it moved the robot, 0 if not.
 
     Where none has determined yet where the map is, the first that agree do.  Later they may be wrong: then the robot
-    moves if they fit an alternative for long.  `fits`: whether this one does.
+    moves if they fit a second hypothesis for long.  `fits`: whether this one does.
     """
-    moving, other = state.moving[name], state.alternatives.get(name)
+    moving, other = state.moving[name], state.pose_hypotheses.get(name)
     if done.fused[0]:
         moving.left_out.clear()
-        state.alternatives.pop(name, None)
+        state.pose_hypotheses.pop(name, None)
         state.placed += 1
         return 0.0
     assert state.t_ns is not None
-    del moving.left_out[: len(moving.left_out) + 1 - replacing.KEPT]
-    moving.left_out.append(replacing.RejectedFix(y, R, done.e[0, : len(y)]))
+    del moving.left_out[: len(moving.left_out) + 1 - relocation_by_fixes.KEPT]
+    moving.left_out.append(relocation_by_fixes.RejectedFix(y, R, done.e[0, : len(y)]))
     size, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
     mean = state.map.mean(moving.slot)
-    found = replacing.pose_by_fixes(mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out)
-    if state.placed < replacing.NEEDED and found is not None:
+    found = relocation_by_fixes.pose_by_fixes(
+        mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out
+    )
+    if state.placed < relocation_by_fixes.NEEDED and found is not None:
         blocks = _blocks(state)
-        if len(state.robots) == 1 and all(replacing.can_move(space) for _, space in blocks):
+        if len(state.robots) == 1 and all(relocation_by_fixes.can_move(space) for _, space in blocks):
             _move(state, blocks, found.shift)
         else:
             write_robot(state.map, moving.slot, found.pose, found.cov)
@@ -142,25 +144,27 @@ def _record_position(state: State, name: str, y: Array, R: Array, done: Correcti
     else:
         _doubt(state, name, found, done, R, fits)
         return 0.0
-    state.placed = replacing.NEEDED
+    state.placed = relocation_by_fixes.NEEDED
     state.clones.forget_current(name)
-    state.alternatives.clear()
+    state.pose_hypotheses.clear()
     moving.left_out.clear()
     return float(np.linalg.norm(state.map.mean(moving.slot)[: len(y)] - mean[: len(y)]))
 
 
-def _doubt(state: State, name: str, found: replacing.Replaced | None, done: Correction, R: Array, fits: bool) -> None:
-    """Keep the alternative for a position that was left out, or begin another if that does not fit either.
+def _doubt(
+    state: State, name: str, found: relocation_by_fixes.Relocation | None, done: Correction, R: Array, fits: bool
+) -> None:
+    """Keep the second hypothesis for a position that was left out, or begin another if that does not fit either.
 
     It begins where the last ones place the robot, if they agree, else with the robot less certain.
     """
-    other = state.alternatives.get(name)
+    other = state.pose_hypotheses.get(name)
     if other is not None:
         other.misses = 0 if fits else other.misses + 1
         if not other.failed:
             return
     assert state.t_ns is not None
-    other = state.alternatives[name] = Alternative.of(state.map, state.moving[name], state.blocks, state.t_ns)
+    other = state.pose_hypotheses[name] = PoseHypothesis.of(state.map, state.moving[name], state.blocks, state.t_ns)
     if found is None:
         other.widen(done.z[0], done.Z[0], R)
     else:
@@ -177,9 +181,9 @@ def _blocks(state: State) -> list[tuple[int, Space]]:
     ]
 
 
-def _move(state: State, blocks: list[tuple[int, Space]], shift: replacing.Shift) -> None:
+def _move(state: State, blocks: list[tuple[int, Space]], shift: relocation_by_fixes.Shift) -> None:
     """Move the whole map; its covariance becomes P + G C G', C of the motion.  Once in a run: O(n^3)."""
-    found = [replacing.shift_block(space, state.map.mean(slot), shift) for slot, space in blocks]
+    found = [relocation_by_fixes.shift_block(space, state.map.mean(slot), shift) for slot, space in blocks]
     rows = state.rows(tuple((slot, space.dof) for slot, space in blocks))
     G = np.concatenate([G_block for _, G_block in found])
     state.map.predict(rows, np.eye(len(rows)), G @ shift.cov @ G.T)

@@ -18,7 +18,7 @@ from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
 from kalmark.tracks.linearity import turn_holds
 from kalmark.tracks.scan import ScanContext
-from kalmark.tracks.surveys import SURVEYED
+from kalmark.tracks.survey_checks import SURVEYED
 
 ELSEWHERE = "its observations do not fit its survey, those of other landmarks do: it is mapped again"
 WIDER = 2.0  # times what a robot that was elsewhere has moved by

@@ -14,7 +14,7 @@ from kalmark.geometry.angles import rotation
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import POINT2, POINT3, SE2, SE3, Rn, Space
 from kalmark.models.landmarks import AnchoredHomogeneous, Wall2D
-from kalmark.slam.replacing import Shift, shift_block
+from kalmark.slam.relocation_by_fixes import Shift, shift_block
 
 R = 0.25 * np.eye(2)
 

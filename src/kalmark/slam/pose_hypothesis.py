@@ -4,7 +4,7 @@ Where readings have placed a robot, some that do not fit are wrong, as those of 
 lost: its wheels slipped, it was carried away, its inertial unit was wrong for a second.  One reading does not
 decide that.  So a second filter of the robot alone begins at it, more uncertain than it takes for that reading to fit.
 It moves by the same controls and is corrected by the same readings of the state.  A receiver that jumps comes back, and
-readings fit the map again.  If they fit the alternative for longer than receivers usually are wrong, it is right.
+readings fit the map again.  If they fit the second hypothesis for longer than receivers usually are wrong, it is right.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from kalmark.arrays import Array
 from kalmark.filter.estimators import Estimator, Update
 from kalmark.filter.map import Map, StochasticMap
 from kalmark.slam.held_control import MotionPart, Moving
-from kalmark.slam.replacing import NEEDED
+from kalmark.slam.relocation_by_fixes import NEEDED
 
-LASTS_S = 30.0  # readings fit an alternative that is right; the errors of receivers among houses seldom last so long
+LASTS_S = 30.0  # readings fit a hypothesis that is right; the errors of receivers among houses seldom last so long
 LASTS_UNIT_S = 10.0  # the same if the state has a velocity: what is wrong with it grows with the square of the time
 WIDER = 100.0  # times the covariance by which a reading fits: it does not show yet what else is wrong, as a bias
 WIDEST, WIDEST_RAD = 1e12, 0.5  # times a covariance, and sigma of an attitude: of what a filter begins with
 
 
 @dataclass
-class Alternative:
+class PoseHypothesis:
     """A robot alone in a map of its own, which has the robots, constants and mounts of the other one in the same slots.
 
     Since `since_ns` its readings fit, but for the last `misses`.
@@ -41,14 +41,14 @@ class Alternative:
     SAVED: ClassVar = ("map", "since_ns", "misses")
 
     @classmethod
-    def of(cls, map_: Map, moving: Moving, blocks: int, since_ns: int) -> Alternative:
+    def of(cls, map_: Map, moving: Moving, blocks: int, since_ns: int) -> PoseHypothesis:
         """Return the present state of the first so many blocks of a map, which are no landmarks."""
         own = StochasticMap()
         for slot, space in enumerate(map_.spaces[:blocks]):
             assert space is not None
             own.add(space, map_.mean(slot))
         own.predict(np.arange(own.n), np.eye(own.n), map_.covariance(range(blocks)))
-        return cls(own, motion_of_alternative(moving), since_ns)
+        return cls(own, motion_of_hypothesis(moving), since_ns)
 
     def widen(self, z: Array, Z: Array, R: Array) -> None:
         """Make the robot more uncertain, in the proportions it has, than it takes for a position of it to fit.
@@ -86,8 +86,8 @@ class Alternative:
         return self.misses >= NEEDED
 
 
-def motion_of_alternative(moving: Moving) -> Moving:
-    """Return how a robot moves in the map of an alternative."""
+def motion_of_hypothesis(moving: Moving) -> Moving:
+    """Return how a robot moves in the map of a second hypothesis."""
     return replace(moving, error=None, left_out=[])
 
 

@@ -109,7 +109,7 @@ def test_an_alternative_is_kept_when_a_map_is_saved(tmp_path: Path) -> None:
     whole, resumed = Unit(31.0, 0), Unit(31.0, 0)
     for unit in (whole, resumed):
         unit.drive(0.0, 37.0)
-    assert "r" in resumed.slam.state.alternatives
+    assert "r" in resumed.slam.state.pose_hypotheses
     resumed.slam.save(tmp_path / "map.kmk")
     resumed.slam = km.Slam.load(tmp_path / "map.kmk")
     for unit in (whole, resumed):

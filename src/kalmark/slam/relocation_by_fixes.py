@@ -5,8 +5,8 @@ Fixes are positions of the robot, or those of an antenna on it, which a sensor o
 A fix outside its gate is left out.  A filter that has lost its robot would leave out all of them.  So the last fixes
 that were left out, one after the other, are compared with the estimated positions of the robot: if a shift and a turn
 about the vertical axis lead from there to all of them, within their noise, the robot is moved by it, or, where fixes
-have fitted before, an `alternative` begins there.  Components that this does not determine, and all correlation of the
-robot with the map, are dropped.
+have fitted before, a second hypothesis begins there.  Components that this does not determine, and all correlation of
+the robot with the map, are dropped.
 
 If nothing has determined yet where the map is in the world, no survey and fewer fixes that fitted than must agree, it
 was the start that was wrong: then the whole map is moved with the robot.  Its covariance gets that of the shift and of
@@ -53,7 +53,7 @@ class Shift(NamedTuple):
     cov: Array
 
 
-class Replaced(NamedTuple):
+class Relocation(NamedTuple):
     """The robot's new pose (3,) or (7,), and the covariance (3, 3) or (6, 6) of that; and by what it was moved."""
 
     pose: Array
@@ -61,7 +61,7 @@ class Replaced(NamedTuple):
     shift: Shift
 
 
-def pose_by_fixes(pose: Array, P: Array, left_out: Sequence[RejectedFix]) -> Replaced | None:
+def pose_by_fixes(pose: Array, P: Array, left_out: Sequence[RejectedFix]) -> Relocation | None:
     """Return the new pose of a robot estimated at `pose` with covariance P; None where fixes do not determine it."""
     if len(left_out) < NEEDED:
         return None
@@ -93,7 +93,7 @@ def pose_by_fixes(pose: Array, P: Array, left_out: Sequence[RejectedFix]) -> Rep
     else:
         new[3:] = multiply(exp(np.array([0.0, 0.0, yaw])), pose[3:])
     t = y0 - np.array([*rotation(yaw) @ p0[:2], *p0[2:]])
-    return Replaced(new, cov, Shift(yaw, t, y0, block_diag(R / len(y), variance)))
+    return Relocation(new, cov, Shift(yaw, t, y0, block_diag(R / len(y), variance)))
 
 
 def can_move(space: Space) -> bool:

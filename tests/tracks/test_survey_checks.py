@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from kalmark.tracks.surveys import MISFITS, TRUSTED, Surveys
+from kalmark.tracks.survey_checks import MISFITS, TRUSTED, Surveys
 
 
 def test_a_landmark_of_which_five_observations_misfit_while_two_others_fit_stands_elsewhere() -> None:
