@@ -28,8 +28,8 @@ from kalmark.results.labels import name_points
 from kalmark.results.plot import draw_map, save_map
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
-from kalmark.results.report import series
 from kalmark.results.run import Run
+from kalmark.results.run_page import series
 from kalmark.results.scene import BODIES, BODY_SIZE, OUTCOME_COLOURS, Scene
 from results_space import slam_for as slam_in_space
 from results_space import spiral, with_camera

@@ -19,8 +19,8 @@ from kalmark.report import Candidate
 from kalmark.results.explain import explain
 from kalmark.results.figure_texts import figure
 from kalmark.results.plot_scan import draw_scan
-from kalmark.results.report import change_rows, report_html, series
 from kalmark.results.run import Run
+from kalmark.results.run_page import change_rows, report_html, series
 from kalmark.results.scene import Scene
 from kalmark.results.warnings import window_warnings
 

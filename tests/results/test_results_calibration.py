@@ -14,8 +14,8 @@ from kalmark.events import Control, Event, Scan
 from kalmark.geometry.frames3d import compose, move, plus, to_frame
 from kalmark.results.filter_description import calibrated_mounts
 from kalmark.results.record import record
-from kalmark.results.report import report_html
 from kalmark.results.run import Run
+from kalmark.results.run_page import report_html
 from kalmark.results.self_calibration import Direction, directions, mount_rows
 from kalmark.simulate import load_world, simulate
 from results_space import FORWARD, MOUNT, NOISE, STEP_NS

@@ -19,8 +19,8 @@ from kalmark.results.gauge import generators, shape_of_points
 from kalmark.results.measures import rigid
 from kalmark.results.plot import draw_map
 from kalmark.results.record import record
-from kalmark.results.report import report_html
 from kalmark.results.run import Run
+from kalmark.results.run_page import report_html
 from kalmark.results.scene import Scene
 from kalmark.results.verdict_text import verdict_lines
 from results_world import circle

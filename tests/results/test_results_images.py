@@ -14,8 +14,8 @@ from kalmark.events import Frame
 from kalmark.logs import Log, open_log, write_native
 from kalmark.results.camera_images import Pictures
 from kalmark.results.record import record
-from kalmark.results.report import report_html
 from kalmark.results.run import Run
+from kalmark.results.run_page import report_html
 from kalmark.results.video import write_video
 from kalmark.simulate import load_world, simulate
 

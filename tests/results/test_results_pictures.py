@@ -25,8 +25,8 @@ from kalmark.results.evaluate import headline
 from kalmark.results.figure_texts import BATCH, ROBOT, TOTALS, column_header, count, figure
 from kalmark.results.plot import LANDMARK_COLOUR, draw_map, save_map
 from kalmark.results.record import record
-from kalmark.results.report import POINTS, common_reasons, figure_text, report_html, series
 from kalmark.results.run import Run
+from kalmark.results.run_page import POINTS, common_reasons, figure_text, report_html, series
 from kalmark.results.scene import Scene, group_steps, stretches_of
 from results_world import circle, slam_for
 

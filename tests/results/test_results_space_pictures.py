@@ -20,8 +20,8 @@ from kalmark.results.landmark_table import EUCLIDEANS, LINES, OTHERS, shapes
 from kalmark.results.plot import Projection, box_corners, draw_map, grid_spacing, save_map
 from kalmark.results.plot_scan import draw_sensor
 from kalmark.results.record import record
-from kalmark.results.report import report_html
 from kalmark.results.run import Run
+from kalmark.results.run_page import report_html
 from kalmark.results.scene import Scene, clip_line, images
 from results_space import FORWARD, SIGMA, START, slam_for, spiral, with_camera
 

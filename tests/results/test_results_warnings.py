@@ -19,8 +19,8 @@ from kalmark.logs.log import Log
 from kalmark.models.motion import Unicycle
 from kalmark.models.sensors import Bearing, RangeBearing
 from kalmark.results.record import record
-from kalmark.results.report import report_html
 from kalmark.results.run import Run
+from kalmark.results.run_page import report_html
 from kalmark.simulate import load_world, simulate
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam

@@ -27,8 +27,8 @@ def bag(
     ] = None,
 ) -> None:
     """List the topics of a ROS bag, their rates, gaps and frames; write a first configuration that maps them."""
+    from kalmark.bags.bag_opening import EXPECTED, find_bag
     from kalmark.bags.first_config import first_config
-    from kalmark.bags.opening import EXPECTED, find_bag
     from kalmark.bags.survey import survey
     from kalmark.files import write
     from kalmark.logs import find_data

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from kalmark.bags.bag_opening import UNDEFINED, Bag, Received
 from kalmark.bags.fields import leaves, offers
 from kalmark.bags.messages import MESSAGES, Message, Seen
-from kalmark.bags.opening import UNDEFINED, Bag, Received
 from kalmark.bags.topics import Carried, Compass, Imu, Posed, Topic
 from kalmark.errors import LogError
 from kalmark.logs.log import Names

@@ -13,6 +13,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.bags import tables
+from kalmark.bags.bag_opening import Bag, Received, find_bag, has_header, header_time, refuse_undeclared_fields
 from kalmark.bags.configured_topics import Asked, sensor_name, short
 from kalmark.bags.messages import (
     MESSAGES,
@@ -20,7 +21,6 @@ from kalmark.bags.messages import (
     Measured,
     Seen,
 )
-from kalmark.bags.opening import Bag, Received, find_bag, has_header, header_time, refuse_undeclared_fields
 from kalmark.bags.state_topics import Gathered, OwnReadings, TopicMessage
 from kalmark.bags.tf_mounts import Mounts
 from kalmark.bags.topics import (

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kalmark.bags.opening import SECOND_NS
+from kalmark.bags.bag_opening import SECOND_NS
 from kalmark.errors import LogError
 
 RECORD = "kalmark_msgs/msg/Record"

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.opening import header_time
+from kalmark.bags.bag_opening import header_time
 from kalmark.bags.topics import Scans
 from kalmark.events import unit_quaternion
 from kalmark.logs.camera_calibration import lens

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.bags.bag_opening import UNDEFINED, Bag, frame_id, has_header, header_time, refuse_undeclared_fields
 from kalmark.bags.fields import landmark_fields, offers
 from kalmark.bags.messages import MESSAGES, Measured, Message
-from kalmark.bags.opening import UNDEFINED, Bag, frame_id, has_header, header_time, refuse_undeclared_fields
 from kalmark.bags.tables import holds_log
 from kalmark.bags.tf_frames import Frames
 from kalmark.bags.topics import Scans

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.bags.bag_opening import Bag, Received
 from kalmark.bags.mcap_writer import RECORD, Outgoing, header_fields
-from kalmark.bags.opening import Bag, Received
 from kalmark.errors import EventError, LogError
 from kalmark.events import Control, Event, Fix, Raw, Scan, label_of_event, sort_key
 from kalmark.logs.log import LandmarkPlaces, Log, PositionTrack, Trajectory

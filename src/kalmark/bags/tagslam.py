@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.bags.opening import Bag, header_time
+from kalmark.bags.bag_opening import Bag, header_time
 from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, sort_key, unit_quaternion

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.bags.bag_opening import frame_id
 from kalmark.bags.configured_topics import Asked, beams_of
 from kalmark.bags.messages import MESSAGES
-from kalmark.bags.opening import frame_id
 from kalmark.bags.tf_frames import Frames
 from kalmark.bags.topics import Carried, InertialTopic, Posed, Topic
 from kalmark.geometry import rotations

@@ -21,7 +21,7 @@ from kalmark.campaign.sweep_cells import Cell, value_as_yaml
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.figure_texts import Figures
-from kalmark.results.report import figure_text, html_table, read_page, tagged
+from kalmark.results.run_page import figure_text, html_table, read_page, tagged
 from kalmark.results.scene import COLOURS
 
 _PANELS = (

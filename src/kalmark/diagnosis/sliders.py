@@ -30,8 +30,8 @@ from kalmark.logs.log import Log
 from kalmark.logs.progress import track
 from kalmark.results.history import History, Ints
 from kalmark.results.measures import anees_interval, nees, nis, pose_error
-from kalmark.results.report import round_significant
 from kalmark.results.run import Run
+from kalmark.results.run_page import round_significant
 
 FACTORS = tuple(2.0**k for k in range(-4, 5))  # of the sigmas
 LEAST_SCANS, MOST_SCANS, MOST_SEEN = 10, 400, 4000  # of the log; the most where no length is given

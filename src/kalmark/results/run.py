@@ -81,7 +81,7 @@ class Run(Recording):
         from kalmark.results.plot import save_figure, save_map  # matplotlib is slow to import
         from kalmark.results.plot_measured import sensors_with_picture
         from kalmark.results.plot_scan import draw_sensor
-        from kalmark.results.report import report_html
+        from kalmark.results.run_page import report_html
 
         folder, picture = Path(folder), picture_of(self)
         endings = dict.fromkeys(("png", picture.format))

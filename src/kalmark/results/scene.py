@@ -1,7 +1,7 @@
 """The content of the pictures of a run: at one step in the frame of the map, and scan by scan in the images of cameras.
 
 A `Scene` has paths, landmarks, truth, fixes and cameras, for robots in the plane (d = 2) and in space (d = 3) alike;
-`kalmark.results.plot` draws it for ``map.png``, `kalmark.results.report` writes it into the page.
+`kalmark.results.plot` draws it for ``map.png``, `kalmark.results.run_page` writes it into the page.
 
 The columns of a camera's measurements determine their kind: `u_px, v_px` is a point; `u1_px, v1_px, u2_px, v2_px` are
 the ends of a segment, four of them the corners of a tag; `ul_px, vl_px, ur_px, vr_px` is a point in a left and a right
