@@ -126,7 +126,7 @@ def find_later_mistake(run: Run, log: Log, first: int) -> Mistake | None:
     if found is None:
         return None
     evidence = f"from t={rest.events[0].t_s:.1f} s on {found.evidence}"
-    return found._replace(evidence=evidence, cure="")
+    return found._replace(evidence=evidence, cure="", of=())
 
 
 def misfits_from(now: Fit) -> int | None:

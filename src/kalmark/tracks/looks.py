@@ -94,7 +94,7 @@ class Looks:
     def restored(self) -> None:
         """Check the arrays of a file.  Raises MapError."""
         shapes = (self.counts.shape, self.table.shape) == ((2, *CELLS), CELLS)
-        if not shapes or not (self.counts >= 0).all() or not (self.table >= 0).all():
+        if not shapes or not (self.counts >= 0).all() or not (self.table >= 0).all() or not self.log_miss < 0.0:
             raise MapError(
                 f"the counts of looks are {self.counts.shape} and {self.table.shape}, expected {(2, *CELLS)}"
             )
