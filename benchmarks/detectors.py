@@ -1,4 +1,4 @@
-"""What a detector costs: processor time of a raw scan of Victoria Park, checks and covariances included.
+"""Cost of a detector: processor time of a raw scan of Victoria Park, checks and covariances included.
 
 KALMARK_DATA=... python benchmarks/detectors.py [--every 4]
 """

@@ -1,4 +1,4 @@
-"""What attacks share: right files to begin with, and what counts as broken."""
+"""Parts that attacks share: right files to begin with, and what counts as broken."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ upkeep: {confirm: 3}
 
 
 class Broken(Exception):
-    """What an input has broken."""
+    """A fault that an input has found."""
 
 
 @dataclass(frozen=True)

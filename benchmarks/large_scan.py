@@ -1,4 +1,4 @@
-"""What a scan of thousands of landmarks takes: all new, then known by their ids.
+"""Cost of a scan of thousands of landmarks: all new, then known by their ids.
 
     python benchmarks/large_scan.py [--landmarks 3000] [--map postponed] [--estimator invariant]
 

@@ -1,4 +1,4 @@
-"""What a step costs as the map grows: whole lawn-mower missions up to 10,000 landmarks, one thread.
+"""Cost of a step as the map grows: whole lawn-mower missions up to 10,000 landmarks, one thread.
 
     make bench-growth      or      python benchmarks/map_growth.py [--sides 7 32 100] [--out out/map_growth]
     python benchmarks/map_growth.py --pace quick           # that mission alone, in the largest of the fields; or slow

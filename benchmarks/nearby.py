@@ -1,4 +1,4 @@
-"""What it costs not to be told which landmark was seen: nearest neighbour over known ids, on large maps.
+"""Cost of unknown ids on large maps: nearest neighbour over known ids.
 
     python benchmarks/nearby.py [--sides 32 100]
 

@@ -1,4 +1,4 @@
-"""What one step costs, in ways that others take: one log, maps of 50 to 10,000 landmarks, ratios within one run.
+"""Cost of one step, in ways that others take: one log, maps of 50 to 10,000 landmarks, ratios within one run.
 
     make bench-peers      or      python benchmarks/peers.py [--landmarks 50 100 200 1000 10000] [--out out/peers]
 

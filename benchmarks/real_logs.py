@@ -1,4 +1,4 @@
-"""What the shipped configurations reach on the real logs, known association.
+"""Figures of the shipped configurations on the real logs, known association.
 
     KALMARK_DATA=... python benchmarks/real_logs.py [--estimator invariant ekf]
 

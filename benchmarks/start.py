@@ -1,4 +1,4 @@
-"""What the first step costs: a new process that imports kalmark and takes one control and two scans.
+"""Cost of the first step: a new process that imports kalmark and takes one control and two scans.
 
     python benchmarks/start.py             # or, in turn with a commit or the folder of another checkout:
     python benchmarks/start.py be0e13e     # the cold first step of both, and their ratio

@@ -1,4 +1,4 @@
-"""What one step costs: one control and one scan of 6 known landmarks, in a steady state.
+"""Cost of one step: one control and one scan of 6 known landmarks, in a steady state.
 
     make bench      or      python benchmarks/step.py [--landmarks 50] [--steps 1000]
 

@@ -156,8 +156,8 @@ def texts(nodes: Iterable[ast.AST]) -> Iterator[str]:
 
 
 def prose() -> Iterator[str]:
-    """Yield the texts and comments of the sources and the pages of the documentation, without the code in them."""
-    for file in modules().values():
+    """Yield the texts and comments of sources and examples and the pages of the documentation, without code."""
+    for file in (*modules().values(), *(ROOT / "examples").glob("*.py")):
         source = file.read_text()
         yield from (CODE.sub("", text) for text in texts(ast.walk(ast.parse(source))) if " " in text)
         tokens = tokenize.generate_tokens(io.StringIO(source).readline)

@@ -1,4 +1,4 @@
-"""What not being told which landmark is which costs: the same log with the ids given and hidden.
+"""Cost of unknown ids: the same log with the ids given and hidden.
 
     python benchmarks/unknown_ids.py dlr dlr_unknown
     python benchmarks/unknown_ids.py mrclam mrclam --set log.ids=hidden --set association.type=auto
@@ -7,7 +7,7 @@ The map without ids is held against that with ids, of landmarks that have one na
 
     python benchmarks/unknown_ids.py mrclam --set "log.robots=[2]"
 
-What could be told at best: all that came before was fused by its true id, and which landmark is the nearest then?
+The best possible decisions: all that came before was fused by its true id, and the nearest landmark is taken.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What else a user would take: visual odometry of OpenCV's parts, and SVO, on the frames that kalmark reads.
+"""Other programs that a user would take: visual odometry of OpenCV's parts, and SVO, on the frames that kalmark reads.
 
     python benchmarks/vision_peers.py visual/tum_fr1_xyz [--set log.fps=30 ...] [--svo PYTHON] [--every 1]
 

@@ -1,4 +1,4 @@
-"""Online: kalmark inside a robot's loop.  The drive and the lidar here are make-believe; yours go in their place.
+"""Online: kalmark inside a robot's loop.  The drive and the lidar here are simulated; yours go in their place.
 
 python examples/02_online_loop.py
 """

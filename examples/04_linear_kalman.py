@@ -1,4 +1,4 @@
-"""The linear Kalman filter is the special case of linear models: a robot that knows its heading and measures positions.
+"""The linear Kalman filter is the special case of linear models: a robot of known heading that measures positions.
 
 With the heading known exactly, moving is an addition and so is measuring a position in the robot's frame.  Forsyth's
 Algorithm 11.3, written out below, and kalmark then give the same numbers.

@@ -1,4 +1,4 @@
-"""The sensors of [S] Table 2, each in a small world of its own: what each is worth, and whether the filter knows it.
+"""The sensors of [S] Table 2, each in a small world of its own: their accuracy, and the consistency of the filter.
 
     python examples/05_table2.py [RUNS [PICTURE]]
 
@@ -25,7 +25,7 @@ RUNS = int(sys.argv[1]) if len(sys.argv) > 1 else 2
 
 def draw(axis: Any, name: str, t_s: tuple[float, ...], anees: Anees) -> None:
     """Draw the ANEES of a sensor over time with its band."""
-    some = np.isfinite(anees.mean[0])  # a slow sensor does not tell at every step
+    some = np.isfinite(anees.mean[0])  # a slow sensor does not measure at every step
     t = np.array(t_s)[some]
     axis.fill_between(t, anees.low[0][some], anees.high[0][some], color="0.85", linewidth=0)
     axis.plot(t, anees.mean[0][some], linewidth=0.9)
