@@ -30,7 +30,7 @@ from kalmark.campaign.running import BATCHED, Plan, configs_of
 from kalmark.simulate import World, load_world
 
 ESTIMATORS = ("invariant", "invariant:iterations=1", "ekf")
-PARTS = ("driven", "in_sight", "reported", "filtered", "scores_of")
+PARTS = ("drive_all", "by_landmark", "filter_run", "scores_of")
 WORLD = """\
 world: {{type: random_field, count: {landmarks}, size_m: 20.0}}
 robots:

@@ -61,8 +61,8 @@ SOURCES = {  # what code is compiled from; of the models the filter depends on `
     "filter": ("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py"),
     "results": ("compiled.py", "geometry/*.py", "filter/kernels.py", "results/measures.py"),
     "campaign": (
-        *("compiled.py", "geometry/*.py", "models/observe.py", "filter/**/*.py", "results/measures.py"),
-        "campaign/engine.py",
+        *("compiled.py", "geometry/*.py", "models/observe.py", "models/landmark_views.py", "filter/**/*.py"),
+        *("results/measures.py", "campaign/engine.py"),
     ),
 }
 

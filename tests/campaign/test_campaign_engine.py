@@ -24,16 +24,20 @@ robots:
     route: {route}
     motion: {{type: {motion}, sigma_along_m_per_sqrt_s: 0.01, sigma_across_m_per_sqrt_s: 0.01}}
     sensors:
-      laser: {{type: range_bearing, {sensor}, mount: {{x_m: 0.3, y_m: -0.1, theta_rad: 0.2}}}}
+      laser: {{type: {sensor}, mount: {{x_m: 0.3, y_m: -0.1, theta_rad: 0.2}}}}
     sensing: {{laser: {sensing}}}
 steps: 150
 dt_s: 0.3
 {rest}
 """
 WAYPOINTS = "{type: waypoints, points_m: [[3, 1], [-2, 4], [-3, -3]], speed_mps: 0.7, turn_radius_m: 0.8}"
-LOOKING_ALL_ROUND = "sigma_range_m: 0.05, sigma_bearing_rad: 0.02"
-HALF_BLIND = "sigma_range_m: 0.05, sigma_range_rel: 0.03, range_min_m: 0.5, range_max_m: 4.0, fov_rad: 4.0"
-WRONG_SCALE = "scale: 1.1, bias_m: 0.05, range_max_m: 8.0"
+LOOKING_ALL_ROUND = "range_bearing, sigma_range_m: 0.05, sigma_bearing_rad: 0.02"
+PLACES = "position, sigma_x_m: 0.05, sigma_y_m: 0.1, range_max_m: 6.0"
+SIGNATURES = "range_bearing_signature, sigma_range_m: 0.05, sigma_range_rel: 0.02, sigma_signature: 0.3"
+HALF_BLIND = (
+    "range_bearing, sigma_range_m: 0.05, sigma_range_rel: 0.03, range_min_m: 0.5, range_max_m: 4.0, fov_rad: 4.0"
+)
+WRONG_SCALE = "range_bearing, scale: 1.1, bias_m: 0.05, range_max_m: 8.0"
 CASES: dict[str, tuple[str, list[str]]] = {
     "one new landmark a step": ("cloister", ["steps=60"]),
     "a range noise that grows": ("loop_b2", ["steps=200"]),
@@ -57,6 +61,10 @@ CASES: dict[str, tuple[str, list[str]]] = {
             rest="{new_per_step: 2, max_per_scan: 5}".strip("{}").replace(", ", "\n"),
         ),
         [],
+    ),
+    "places": (DRIVE.format(route=WAYPOINTS, motion="unicycle", sensor=PLACES, sensing="{}", rest=""), []),
+    "signatures, and a range noise that grows": (
+        DRIVE.format(route=WAYPOINTS, motion="odometry_2d", sensor=SIGNATURES, sensing="{every: 2}", rest=""), [],
     ),
     "hidden landmarks": ("cloister", ["steps=60", "robots.robot.sensing={lidar: {dropouts: 0.1, hidden: [3]}}"]),
     "stops of the robot": (
@@ -111,9 +119,9 @@ def test_a_run_has_the_numbers_of_the_ordinary_path(case: str, tmp_path: Path) -
         ("cloister", [], "fej", "no estimator fej"),
         ("loop_c", ["world.count=200"], "invariant", "up to 193 landmarks"),
         ("cloister", ["ids=false"], "invariant", "known ids"),
-        ("camera", [], "invariant", "ranges and bearings"),
+        ("camera", [], "invariant", "determine points"),
         ("cloister", ["robots.robot.sensing={lidar: {outliers: 0.1}}"], "invariant", "no outliers"),
-        ("cloister", ["filter={landmarks: {type: polar}}"], "invariant", "points with known ids"),
+        ("cloister", ["filter={landmarks: {type: polar}}"], "invariant", "determine points"),
         ("cloister", ["filter={map: {type: postponed}}"], "invariant", "dense maps"),
     ],
 )

@@ -35,11 +35,11 @@ def events(names: tuple[str, ...], held: bool) -> Iterator[Any]:
             yield km.Scan(float(t) + 0.4 * held, name, "lidar", y, ids)
 
 
-def slam_of(names: tuple[str, ...], held: bool, off_m: float = 0.0, **settings: Any) -> km.Slam:
+def slam_of(names: tuple[str, ...], held: bool, off_m: float = 0.0, rel: float = 0.0, **settings: Any) -> km.Slam:
     motion: Any = km.motion.Unicycle(0.05, 0.02) if held else km.motion.Odometry2D(0.02, 0.01, 0.01)
+    sensor = km.sensors.RangeBearing(0.1, 0.02, sigma_range_rel=rel)
     robots = [
-        km.Robot(name, motion, (0.0, i, 0.1), {"lidar": km.Mount(km.sensors.RangeBearing(0.1, 0.02))}, gaps="widen")
-        for i, name in enumerate(names)
+        km.Robot(name, motion, (0.0, i, 0.1), {"lidar": km.Mount(sensor)}, gaps="widen") for i, name in enumerate(names)
     ]
     slam = km.Slam(robots, **settings)
     for i in range(8):
@@ -63,6 +63,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "gate off": {"association": km.association.ByIdentity("off")},
     "gate": {"association": km.association.ByIdentity(0.99)},
     "wrong survey": {"off_m": 1.0},
+    "a range noise that grows": {"rel": 0.05},
 }
 
 

@@ -9,35 +9,33 @@ whose filter diverges, is left to the ordinary path, too.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.random import SeedSequence
 
 from kalmark.arrays import Array, Index
-from kalmark.association import ByIdentity
 from kalmark.campaign.scoring import SERIES, Scores, scores_of
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.config.building import build_robot, build_slam
 from kalmark.config.schema import Config
 from kalmark.filter import corrections, kernels, prediction
 from kalmark.filter.estimators import Ekf, Invariant
+from kalmark.filter.map import StochasticMap
 from kalmark.filter.maps import DENSE
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames import compose, from_frame_many, inv_scan_many
-from kalmark.geometry.spaces import HEADING, VECTOR, Table
-from kalmark.management.attention import EVERYTHING
+from kalmark.geometry.frames import compose
+from kalmark.geometry.spaces import Table
+from kalmark.models.landmark_views import LOOK, NOISE, look, noise_of
 from kalmark.models.landmarks import Point2D
-from kalmark.models.observe import step_of
-from kalmark.models.protocols import parameter_covariance, self_calibrating
-from kalmark.models.sensors import RangeBearing
+from kalmark.models.observe import MOUNT, call_linearize, step_of
+from kalmark.models.protocols import self_calibrating
 from kalmark.results.measures import MAP_NEES, log_translation, map_nees
 from kalmark.simulate.robots import Chance, drive_all, scenery_of, sight, spans
 from kalmark.simulate.routes import MOTIONS, compiled_ways
 from kalmark.simulate.sights import POINTS, Sighted
 from kalmark.simulate.worlds import World
-from kalmark.slam.robot import Mount
 from kalmark.slam.slam import Slam
 
 PREDICT = signature_of(
@@ -50,81 +48,65 @@ CORRECT = signature_of(
 call_predict, call_correct = by_address(PREDICT), by_address(CORRECT)
 
 
-# of ranges and bearings: sigma_range_m, sigma_range_rel, sigma_bearing_rad, scale and bias_m
-Noise = tuple[float, float, float, float, float]
-Observations = tuple[Index, Index, Index, Array, Array]  # as `by_landmark` returns
+# the first four that `by_landmark` returns, of each measurement the noise, of each landmark its first view v (L, d) and
+# the covariance of that
+Observations = tuple[Index, Index, Index, Array, Array, Array, Array]
 
 
 # ---------------------------------------------------------------------- what the engine runs
 def refusal(world: Any, configs: Mapping[str, Config]) -> str:
-    """Return the reasons why the engine does not run a scene with these filters; empty if it does."""
+    """Return the reason why the engine does not run a scene with these filters; empty if it does."""
+    return next((f"the batched engine {why}" for why in _reasons(world, configs)), "")
+
+
+def _reasons(world: Any, configs: Mapping[str, Config]) -> Iterator[str]:
+    """Yield the first thing in a scene and its filters that the engine does not run."""
     if not isinstance(world, World):
-        return "the batched engine does not replay logs"
+        yield "does not replay logs"
     if world.dimensions != 2 or len(world.robots) != 1:
-        return "the batched engine runs one robot of the plane"
+        yield "runs one robot of the plane"
     ((name, simulated),) = world.robots.items()
-    if len(simulated.sensors) != 1:
-        return "the batched engine runs one sensor"
-    robot = build_robot(world.models(), name)
-    (mount,) = robot.sensors.values()
-    why = _odd_models(robot.motion, mount)
-    if not why and any(sensing.outliers or sensing.swapped for sensing in simulated.sensing.values()):
-        why = "the batched engine has no outliers and no swapped ids: it rejects nothing"
-    if not why and not world.ids:
-        why = "the batched engine needs known ids"
+    if any(sensing.outliers or sensing.swapped for sensing in simulated.sensing.values()):
+        yield "has no outliers and no swapped ids: it rejects nothing"
     things = scenery_of(world, np.random.default_rng(0))
-    if not why and sum(len(sort.values) for sort in things.values()) > len(things[POINTS].values):
-        why = "the batched engine has no landmarks but points"
-    return why or next(filter(None, (_odd_filter(c, name, len(things[POINTS].values)) for c in configs.values())), "")
+    landmarks = len(things[POINTS].values)
+    if not world.ids or sum(len(sort.values) for sort in things.values()) > landmarks:
+        yield "needs landmarks that are points with known ids"
+    robots = [build_robot(world.models(), name), *(build_robot(config, name) for config in configs.values())]
+    if any(type(robot.motion) not in MOTIONS or self_calibrating(robot.motion) is not None for robot in robots):
+        yield "has velocities and increments of the plane that do not calibrate themselves"
+    for config in configs.values():
+        yield from _odd_filter(config, landmarks)
 
 
-def _odd_models(motion: Any, mount: Mount) -> str:
-    """Return what of a motion and a mounted sensor the engine does not run."""
-    if type(motion) not in MOTIONS or self_calibrating(motion) is not None:
-        return "the batched engine has velocities and increments of the plane that do not calibrate themselves"
-    if (
-        type(mount.sensor) is not RangeBearing
-        or parameter_covariance(mount.sensor) is not None
-        or mount.cov is not None
-        or mount.lags
-        or mount.detector is not None
-    ):
-        return "the batched engine has ranges and bearings, of a sensor whose calibration is known"
-    return ""
-
-
-def _odd_filter(config: Config, name: str, landmarks: int) -> str:
-    """Return what of a filter the engine does not run."""
+def _odd_filter(config: Config, landmarks: int) -> Iterator[str]:
+    """Yield the first thing in a filter that the engine does not run."""
     if config.map.known is not None:
-        return "the batched engine has no known maps"
+        yield "has no known maps"
     slam = build_slam(config)
-    robot = slam.robots[name]
-    ((key, mount),) = robot.sensors.items()
-    policy, channel = slam.state.policies[name, key], slam.state.channels[name, key]
-    if why := _odd_models(robot.motion, mount):
-        return why
+    (robot,), keys = slam.robots.values(), [*slam.state.channels]
+    if len(robot.sensors) != 1 or not keys:
+        yield "runs one sensor, of landmarks"
+    channel, policy = slam.state.channels[keys[0]], slam.state.policies[keys[0]]
+    late, model = (policy.deferred, policy.delayed, policy.detector), channel.models[channel.landmark.kind]
+    if any(late) or not (policy.by_ids and channel.gives_places and channel.mount < 0 and model.built_in):
+        yield "has sensors of known calibration that determine points, all of them with known ids, used and kept"
     if type(slam.estimator) not in (Ekf, Invariant):
-        return f"the batched engine has no estimator {config.estimator.type}"
-    if type(policy.association) is not ByIdentity or type(channel.landmark) is not Point2D:
-        return "the batched engine has points with known ids"
+        yield f"has no estimator {config.estimator.type}"
     is_gated = policy.association.threshold(channel.dof, math.inf) < math.inf
-    if channel.robust is not None or is_gated or (robot.max_speed_mps, robot.max_turn_radps) != (None, None):
-        return "the batched engine has no robust weights, no gate that is set, and no limits of its robot"
-    plain = mount.attention == EVERYTHING and mount.initialization is None
-    if not plain or policy.upkeep.p_detect is not None:
-        return "the batched engine uses all that is seen, and keeps it"
+    if is_gated or (robot.max_speed_mps, robot.max_turn_radps) != (None, None):
+        yield "has no gate that is set, and no limits of its robot"
     kind = slam.state.settings.map
     if kind == "postponed" or (kind == "auto" and landmarks > DENSE):
-        return f"the batched engine has dense maps, of up to {DENSE} landmarks"
-    return ""
+        yield f"has dense maps, of up to {DENSE} landmarks"
 
 
 # ---------------------------------------------------------------------- observations
-def by_landmark(count: int, steps: Index, numbers: Index, places: Array, y: Array) -> Observations:
-    """Return measurements y (N, 2) of points at `places` (N, 2) in `count` steps, in each those of new landmarks last.
+def by_landmark(count: int, steps: Index, numbers: Index, y: Array) -> tuple[Any, ...]:
+    """Return measurements y (N, m) of the points `numbers` (N,) in `count` steps, in each those of new landmarks last.
 
     That is where each step begins (count + 1,), where its new ones do (count,), the places of landmarks in the state
-    (N,), y (N, 2) and where the landmarks are (L, 2), in the order in which they are seen first.
+    (N,), y (N, m), and of each landmark its first measurement (L, m) and its number (L,), in the order of these.
     """
     first, place = np.zeros((2, numbers.max(initial=0) + 1), np.int64)
     first[numbers[::-1]] = np.arange(len(numbers))[::-1]  # the last one that is written
@@ -133,7 +115,7 @@ def by_landmark(count: int, steps: Index, numbers: Index, places: Array, y: Arra
     rows = np.lexsort((new, steps))
     begins = np.searchsorted(steps, np.arange(count + 1))
     middle = begins[1:] - np.bincount(steps[new], minlength=count)
-    return begins, middle, place[numbers[rows]], y[rows], places[new]
+    return begins, middle, place[numbers[rows]], y[rows], y[new], numbers[new]
 
 
 # ---------------------------------------------------------------------- filter
@@ -144,168 +126,159 @@ def textbook(view: Any, map_: Any, scan: Any, limits: tuple[int, float]) -> Any:
 
 
 @compiled
-def range_variance(noise: Noise, x: float, y: float) -> float:
-    """Return the variance of the range of a point at x, y in the sensor's frame, as `RangeBearing.noise_at`."""
-    return noise[0] ** 2 + (noise[1] * (noise[3] * math.sqrt(x * x + y * y) + noise[4])) ** 2
-
-
-@compiled
-def noises(
-    x: Array, slots: Index, at: Array, noise: Noise
-) -> Array:  # fmt: skip
-    """Return the noise R (K, 2, 2) of observing the landmarks on `slots` (K,), at their expected ranges."""
-    R = np.zeros((len(slots), 2, 2))
-    T = compose(x[:3], at)[0]
-    c, s = math.cos(T[2]), math.sin(T[2])
+def expectations_of(view: Any, x: Array, blocks: Table, slots: Index, y: Array) -> Array:
+    """Return the expectations (K, m) of measurements y (K, m) of the landmarks on `slots` (K,)."""
+    l = np.empty((len(slots), blocks[1, 1]))
     for i in range(len(slots)):
-        j = 1 + 2 * slots[i]
-        d_x, d_y = x[j] - T[0], x[j + 1] - T[1]
-        R[i, 0, 0] = range_variance(noise, c * d_x + s * d_y, c * d_y - s * d_x)
-        R[i, 1, 1] = noise[2] ** 2
-    return R
+        for j in range(l.shape[1]):
+            l[i, j] = x[blocks[slots[i], 0] + j]
+    return call_linearize(view[0], (view, x[:3], l, y))[0]
 
 
 @compiled
 def start_landmark(
-    x: Array, x_first: Array, P: Array, n: int, at: Array, y: Array,
-    noise: Noise,
+    of: int, at: Array, x: Array, x_first: Array, P: Array, block: Index, v: Array, Q: Array
 ) -> None:  # fmt: skip
-    """Add the landmark that explains y (1, 2) from a mount `at` (3,) to the n rows of a map.  [S] (32)-(38)."""
+    """Add a landmark on a block (6,), seen at v (1, d) with a covariance Q (d, d) from a mount.  [S] (32)-(38)."""
     T, T_r, _ = compose(x[:3], at)
-    seen = y.copy()
-    seen[0, 0] = (y[0, 0] - noise[4]) / noise[3]
-    v, V_y = inv_scan_many(seen)
-    l, L_T, L_v = from_frame_many(T, v)
-    for i in range(2):
-        V_y[0, i, 0] /= noise[3]
-        x[n + i] = x_first[n + i] = l[0, i]
-    L_r, L_y, R = kernels.product(L_T[0], T_r), kernels.product(L_v[0], V_y[0]), np.zeros((2, 2))
-    R[0, 0], R[1, 1] = range_variance(noise, v[0, 0], v[0, 1]), noise[2] ** 2
-    kernels.augment(P, n + 2, np.arange(n, n + 2), np.arange(3), L_r, kernels.quadratic(L_y, R))
+    l, L_T, L_v = look(of, (T, v))
+    for i in range(block[1]):
+        x[block[0] + i] = x_first[block[0] + i] = l[0, i]
+    n, L_r = block[2] + block[3], kernels.product(L_T[0], T_r)
+    kernels.augment(P, n, np.arange(block[2], n), np.arange(3), L_r, kernels.quadratic(L_v[0], Q))
 
 
 @compiled
 def filter_run(
-    ways: tuple[int, int, int], routines: corrections.Routines, view: Any, motion: tuple[int, Array],
-    tables: tuple[Table, Table, int], started: tuple[Array, Array], controls: tuple[Array, Array, Array, Array, bool],
-    observations: Observations, sensed: tuple[Array, Noise],
-    rules: tuple[float, int, float], scored: tuple[int, bool, Array],
+    ways: tuple[int, int, int, int, int], view: Any, started: corrections.Map, motion: tuple[int, Array],
+    controls: tuple[Array, Array, Array, Array, bool], observations: Observations, noise: Array,
+    rules: tuple[float, tuple[int, float]], scored: tuple[int, bool, Array, Array],
 ) -> tuple[bool, Array, Array, Array, Array, float, int]:  # fmt: skip
     """Filter a run: predict, correct and start landmarks step by step, as `Slam.process` does with known ids.
 
-    `ways` are the addresses of the prediction, the correction and the generator, `tables` the blocks and the atoms of a
-    robot and all landmarks and the capacity of a covariance, `controls` u (steps, m), seconds (steps,), the covariance
-    N of a control's error, the diffusion (3 or 0, .) a second and whether controls are held, `sensed` the mount and
-    its noise, `rules` the gate and the limits of the iterations, `scored` how often `score_map` scores, its `turns` and
-    the true states (steps + 1, 3).
+    `ways` are the addresses of the prediction, the correction, the generator, the landmark of a view and the noise at
+    an expectation (0: it is that of `observations`), which has the numbers `noise`.  `started` is the map before the
+    first step, with a block for each landmark to come.  `controls` are u (steps, m), seconds (steps,), the covariance N
+    of a control's error, the diffusion (3 or 0, .) a second and whether controls are held, `rules` the gate and the
+    limits of the iterations, `scored` how often `score_map` scores, its `turns`, the true states (steps + 1, 3) and
+    places (L, 2).
 
-    Returns whether all went well, the pose (steps, 3) after each scan and its covariance, the scores of the map
-    (steps, 6), the mean in the end, the sum of d2 and how many were fused.
+    Returns whether all went well, the pose (steps, 3) after each scan and the lower triangle of its covariance, the
+    scores of the map (steps, 6), the mean in the end, the sum of d2 and how many were fused.
     """
-    blocks, atoms, capacity = tables
+    x_0, P_0, _, blocks, atoms, axes, routines = started
+    predicts, corrects, turns, of, noisy = ways
     u, dt_s, N, density, held = controls
-    first, new, slots, y, places = observations
-    at, noise = sensed
-    steps, axes, robot, mount, d, never = len(u), 1, 0, -1, 2, False
-    no_effect = np.empty((u.shape[1], 0))
-    x, x_first, P = np.zeros(capacity), np.zeros(capacity), np.zeros((capacity, capacity))
-    x[:3] = x_first[:3] = started[0]
-    P[:3, :3] = started[1]
+    first, new, slots, y, R, v, Q = observations
+    steps, robot, mount, never = len(u), 0, -1, False
+    x, x_first, P, no_effect = x_0.copy(), x_0.copy(), P_0.copy(), np.empty((u.shape[1], 0))
     mean, cov, scores = np.full((steps, 3), np.nan), np.full((steps, 3, 3), np.nan), np.full((steps, 6), np.nan)
     none, nothing, count, nis, fused, ok = np.empty(0, np.int64), np.zeros((0, 0)), 0, 0.0, 0, True
     for k in range(steps):
         low, middle, high = first[k], new[k], first[k + 1]
         if held and k == steps - 1 and high == low:
             break  # no later event asks where the robot is
-        n = 3 + 2 * count
+        there, kinds = blocks[: count + 1], atoms[: blocks[count, 4] + blocks[count, 5]]
+        n = blocks[count, 2] + blocks[count, 3]
         D = density * dt_s[k] if len(density) and u[k].any() else nothing
-        map_ = x, x_first, P, n, blocks[: count + 1], atoms[: count + 2], ways[2]
         part = motion, robot, none, never, never, no_effect, u[k], N, D, dt_s[k]
-        ok = call_predict(ways[0], (map_, part, never, never))
+        ok = call_predict(predicts, ((x, x_first, P, n, there, kinds, turns), part, never, never))
         if ok and middle > low:
-            whole = x, P, n, blocks[: count + 1], atoms[: count + 2], axes, routines
-            known = slots[low:middle]
-            scan = robot, mount, known, d, y[low:middle], noises(x, known, at, noise), rules[0]
-            _e, _z, _Z, d2, near, ok = call_correct(ways[1], (view, whole, scan, (rules[1], rules[2])))
-            for i in range(len(known)):
-                nis += d2[i] if near[i] else 0.0
-                fused += near[i]
+            known, seen, R_k, d = slots[low:middle], y[low:middle], R[low:middle], blocks[1, 1]
+            if noisy != 0:
+                R_k = noise_of(noisy, (noise, expectations_of(view, x, blocks, known, seen)))
+            scan = robot, mount, known, d, seen, R_k, rules[0]
+            _e, _z, _Z, d2, near, ok = call_correct(
+                corrects, (view, (x, P, n, there, kinds, axes, routines), scan, rules[1])
+            )
+            near_d2 = d2[near]
+            nis, fused = nis + np.sum(near_d2), fused + len(near_d2)
         if not ok:
             break
-        for i in range(middle, high):
-            start_landmark(x, x_first, P, 3 + 2 * count, at, y[i : i + 1], noise)
+        for _ in range(middle, high):
+            start_landmark(of, view[MOUNT], x, x_first, P, blocks[count + 1], v[count : count + 1], Q[count])
             count += 1
         if high > low:
-            keep_pose(x, P, mean[k], cov[k])
+            mean[k], cov[k] = x[:3], P[:3, :3]
             if (k + 1) % scored[0] == 0 or k == steps - 1:
-                scores[k] = score_map(x, P, places[:count], scored[1], scored[2][k + 1])
+                scores[k] = score_map(x, P, blocks[1 : count + 1], scored[3], scored[1], scored[2][k + 1])
     return ok, mean, cov, scores, x, nis, fused
 
 
 # ---------------------------------------------------------------------- scores
 @compiled
-def keep_pose(x: Array, P: Array, mean: Array, cov: Array) -> None:
-    """Write the mean (3,) and the covariance (3, 3) of the robot's pose."""
-    for i in range(3):
-        mean[i] = x[i]
-        for j in range(3):
-            cov[i, j] = P[max(i, j), min(i, j)]
-
-
-@compiled
-def score_map(x: Array, P: Array, places: Array, turns: bool, truth: Array) -> Array:
-    """Return the NEES of the map (6,), as `map_nees`.
+def score_map(x: Array, P: Array, blocks: Table, places: Array, turns: bool, truth: Array) -> Array:
+    """Return the NEES of the map (6,), as `map_nees`, of landmarks whose `blocks` (B, 6) begin with their positions.
 
     `turns`: errors are in the invariant filter's coordinates.  `truth` is the true state (3,) of the robot, `places`
-    (B, 2) where the landmarks truly are.
+    (B or more, 2) where the landmarks truly are.
     """
-    a, d = wrap(truth[2] - x[2]), np.empty((2, 3 + 2 * len(places)))
-    d[0, 2] = d[1, 2] = a
-    for i in range(len(places) + 1):
-        j, true = (2 * i + 1, places[i - 1]) if i else (0, truth[:2])
-        d[1, j], d[1, j + 1] = true[0] - x[j], true[1] - x[j + 1]
+    count, a = len(blocks), wrap(truth[2] - x[2])
+    d, index = np.empty((2, 3 + 2 * count)), np.empty(3 + 2 * count, np.int64)
+    d[0, 2], d[1, 2], index[2] = a, a, 2
+    for i in range(count + 1):
+        j, at, row, true = (2 * i + 1, blocks[i - 1, 0], blocks[i - 1, 2], places[i - 1]) if i else (0, 0, 0, truth[:2])
+        index[j], index[j + 1] = row, row + 1
+        d[1, j], d[1, j + 1] = true[0] - x[at], true[1] - x[at + 1]
         d[0, j], d[0, j + 1] = log_translation(a if turns else 0.0, d[1, j], d[1, j + 1])
-    return map_nees(d, P, 3 + 2 * np.arange(len(places)), np.full(len(places), 2))
+    return map_nees(d, kernels.submatrix(P, index), 3 + 2 * np.arange(count), np.full(count, 2))
 
 
 # ---------------------------------------------------------------------- runs
 class _Filter:
     """An estimator of the engine: the arguments of `filter_run` that are the same in all runs."""
 
-    def __init__(self, slam: Slam, name: str, landmarks: int) -> None:
-        robot, estimator = slam.robots[name], slam.estimator
-        ((key, mount),) = robot.sensors.items()
-        channel, motion = slam.state.channels[name, key], robot.motion
-        assert isinstance(motion, MOTIONS) and isinstance(mount.sensor, RangeBearing)
-        correct = corrections.invariant if isinstance(estimator, Invariant) else textbook
+    def __init__(self, slam: Slam, landmarks: int) -> None:
+        (robot,), estimator = slam.robots.values(), slam.estimator
+        (self.channel,), map_ = slam.state.channels.values(), slam.state.map
+        landmark, sensor, motion = self.channel.landmark, self.channel.sensor, robot.motion
+        assert isinstance(map_, StochasticMap) and isinstance(landmark, Point2D) and isinstance(motion, MOTIONS)
+        for _ in range(landmarks):
+            map_.add(landmark.space, np.zeros(landmark.space.size))
+        self.started, self.coordinates = map_.whole, estimator.coordinates
+        correct: Any = textbook
+        limits = 1, 0.0
+        if isinstance(estimator, Invariant):
+            correct, limits = corrections.invariant, (estimator.iterations, float(estimator.tolerance))
+        varies = self.channel.noise_at is not None
         self.ways = (
-            address_of(prediction.predict, PREDICT), address_of(correct, CORRECT),
-            corrections.generator_address(1),
+            address_of(prediction.predict, PREDICT), address_of(correct, CORRECT), corrections.generator_address(1),
+            address_of(landmark.of, LOOK), address_of(type(sensor).noisy, NOISE) if varies else 0,
         )  # fmt: skip
-        self.routines = corrections.routines(1, False, False)
-        self.view, self.motion = channel.models["point"].model, step_of(robot.motion)
-        rows = 3 + 2 * np.arange(landmarks)
-        columns = (rows, 2, rows, 2, np.arange(landmarks) + 2, 1)
-        blocks = np.column_stack(np.broadcast_arrays(*columns))
-        atoms = np.column_stack(np.broadcast_arrays(VECTOR, rows, rows))
-        self.blocks = np.concatenate([[[0, 3, 0, 3, 0, 2]], blocks])
-        self.atoms = np.concatenate([[[VECTOR, 0, 0], [HEADING, 2, 2]], atoms])
-        self.capacity = capacity_for(3 + 2 * landmarks)
-        cov = np.zeros((3, 3)) if robot.cov is None else np.asarray(robot.cov)
-        self.start = np.array(robot.start), np.array(cov)
+        self.noise = sensor.noise_numbers if varies else np.zeros(0)
+        self.view, self.motion = self.channel.models[landmark.kind].model, step_of(motion)
         u = np.ones(len(motion.columns))
         D = motion.diffusion(u, 1.0)
         self.control = motion.control_noise(u), np.zeros((0, 0)) if D is None else D, motion.held
-        s = mount.sensor
-        self.sensed = np.array(mount.at), (s.sigma_range_m, s.sigma_range_rel, s.sigma_bearing_rad, s.scale, s.bias_m)
-        limits = (estimator.iterations, float(estimator.tolerance)) if isinstance(estimator, Invariant) else (1, 0.0)
-        self.rules = (float(channel.gate), *limits)
-        self.coordinates = estimator.coordinates
+        self.rules = float(self.channel.gate), limits
 
+    def run(
+        self, given: tuple[Array, Array], seen: Sequence[Any], truth: tuple[Array, Array], map_every: int
+    ) -> Scores | None:  # fmt: skip
+        """Filter and score a run; None if the filter diverges.
 
-def capacity_for(rows: int) -> int:
-    """Return a width of a covariance of so many rows: an odd number of cache lines, see `layout.CAPACITY`."""
-    return 16 * (rows // 16) + 8 if rows % 16 <= 8 else 16 * (rows // 16) + 24
+        `given` are the controls (steps, m) and their seconds (steps,), `seen` is what `by_landmark` returns but the
+        last, `truth` the states (steps + 1, 3) and the places of the landmarks (L, 2).
+        """
+        first, new, slots, y, begun = seen
+        sensor, noise_at = self.channel.sensor, self.channel.noise_at
+        v, V_y = sensor.invert(begun)
+        N = sensor.noise(begun) if noise_at is None else noise_at(v)
+        observations = first, new, slots, y, sensor.noise(y), v, V_y @ N @ V_y.swapaxes(1, 2)
+        scored = map_every, self.coordinates == "log", *truth
+        ok, mean, L, of_map, x, nis, fused = filter_run(
+            self.ways, self.view, self.started, self.motion, (*given, *self.control), observations, self.noise,
+            self.rules, scored,
+        )  # fmt: skip
+        if not ok:
+            return None
+        series = {key: np.full((1, len(mean)), np.nan) for key in SERIES}
+        for i, key in enumerate(MAP_NEES):
+            series[key][0] = of_map[:, i]
+        (states, places), dof = truth, self.channel.dof * fused
+        at = self.started[3][1 : len(places) + 1, :1] + np.arange(2)
+        found, P = (x[at], places, len(places), len(places)), np.tril(L) + np.tril(L, -1).swapaxes(1, 2)
+        return scores_of(series, mean[None], P[None], states[None, 1:], self.coordinates, found, nis, dof, "")
 
 
 class Engine:
@@ -316,7 +289,7 @@ class Engine:
         (name,) = world.robots
         self.robot = build_robot(world.models(), name)
         self.landmarks = len(scenery_of(world, np.random.default_rng(0))[POINTS].values)
-        self.filters = {label: _Filter(build_slam(c), name, self.landmarks) for label, c in configs.items()}
+        self.filters = {label: _Filter(build_slam(c), self.landmarks) for label, c in configs.items()}
         self.ways = compiled_ways(self.robot.motion, world.dt_s)
         self.seconds = np.diff([0, *world.times()]) * 1e-9  # of each control: an increment's first has none before it
         self.seconds[0] *= self.robot.motion.held
@@ -325,37 +298,20 @@ class Engine:
         """Simulate and score one run under every filter; None if that is left to the ordinary path."""
         world, chance = self.world, Chance(seed)
         (robot,), things = drive_all(world, [self.robot], chance, self.ways)
-        (carried,), points = robot.sensors.values(), things[POINTS].values
+        (carried,), places = robot.sensors.values(), things[POINTS].centres()
         parts = [
             part
             for steps in spans(world, [robot], things)
             for part in sight(carried, robot, [robot], things, world, steps[carried.sensing.scans_at(steps)], chance)
         ]
-        if len(points) != self.landmarks or not parts:
+        if len(places) != self.landmarks or not parts:
             return None
         seen = Sighted(*map(np.concatenate, zip(*parts, strict=True)))
-        observations = by_landmark(world.steps, seen.steps - 1, seen.ids, points[seen.ids - 1], seen.e)
-        scores = {}
+        *observations, numbers = by_landmark(world.steps, seen.steps - 1, seen.ids, seen.e)
+        truth, scores = (robot.states, places[numbers - 1]), {}
         for label, one in self.filters.items():
-            score = self._filter(one, robot.states, robot.given, observations, map_every)
+            score = one.run((robot.given, self.seconds), observations, truth, map_every)
             if score is None:
                 return None
             scores[label] = score
         return scores
-
-    def _filter(self, f: _Filter, states: Array, u: Array, observations: Observations, map_every: int) -> Scores | None:
-        """Filter and score a run; None if the filter diverges."""
-        N, density, held = f.control
-        scored = map_every, f.coordinates == "log", states
-        ok, mean, P, of_map, x, nis, fused = filter_run(
-            f.ways, f.routines, f.view, f.motion, (f.blocks, f.atoms, f.capacity), f.start,
-            (u, self.seconds, N, density, held), observations, f.sensed, f.rules, scored,
-        )  # fmt: skip
-        if not ok:
-            return None
-        series = {key: np.full((1, len(u)), np.nan) for key in SERIES}
-        for i, key in enumerate(MAP_NEES):
-            series[key][0] = of_map[:, i]
-        places = observations[-1]
-        found = x[3 : 3 + places.size].reshape(-1, 2), places, len(places), len(places)
-        return scores_of(series, mean[None], P[None], states[None, 1:], f.coordinates, found, nis, 2 * fused, "")

@@ -38,7 +38,9 @@ LOOK = signature_of("Tuple((f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))(f8[::1], 
 EXPECT = signature_of("Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1]))(i8, f8[::1], b1[::1], f8[:, ::1], f8[:, ::1])")
 # of the same, with what is expected: how the expectations change with the sensor's parameters, E_p (K, p, c)
 VARY = signature_of("f8[:, :, ::1](i8, f8[::1], b1[::1], f8[:, ::1], f8[:, ::1])")
-look, expect, vary = by_address(LOOK), by_address(EXPECT), by_address(VARY)
+# of the numbers of a noise and of expected measurements (K, m): the noise R (K, p, p)
+NOISE = signature_of("f8[:, :, ::1](f8[::1], f8[:, ::1])")
+look, expect, vary, noise_of = by_address(LOOK), by_address(EXPECT), by_address(VARY), by_address(NOISE)
 
 
 # ------------------------------------------------------------------ landmarks
@@ -209,12 +211,16 @@ def constant(variances: tuple[float, ...], count: int) -> Array:
 
 
 class Sensing:
-    """Base of all sensors: `columns`, and white noise whose `sigmas` are the parameters of these names."""
+    """Base of all sensors: `columns`, and white noise whose `sigmas` are the parameters of these names.
+
+    Where it depends on what is expected, the compiled `noisy`, of the form NOISE, has it of `noise_numbers`.
+    """
 
     columns: ClassVar[tuple[str, ...]]
     sigmas: ClassVar[tuple[str, ...]]
     expected: ClassVar[Any]
     varied: ClassVar[Any] = None
+    noisy: ClassVar[Any] = None
     world: ClassVar[str]
     sees_kinds: ClassVar[tuple[str, ...]]
     finds_depth: ClassVar[bool]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY, replace
+from functools import cached_property
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -79,6 +80,21 @@ def by_gain_and_offset(code: int, par: Array, angular: Flags, v: Array, e: Array
     return E_p
 
 
+@compiled
+def range_noise(numbers: Array, e: Array) -> Array:
+    """Return the noise (K, p, p) of measurements e (K, m), the first a range r: its variance is a^2 + (b r)^2.
+
+    `numbers` (p + 1,) are the constant variances, a^2 first, and b.
+    """
+    p = len(numbers) - 1
+    R = np.zeros((len(e), p, p))
+    for i in range(len(e)):
+        for j in range(p):
+            R[i, j, j] = numbers[j]
+        R[i, 0, 0] += (numbers[p] * e[i, 0]) ** 2
+    return R
+
+
 class _Planar(Cone):
     """Base of the planar sensors: limits of range, built-in expectation."""
 
@@ -109,7 +125,7 @@ class _Ranging(Expecting):
         if not (self.sigma_range_m or self.sigma_range_rel):
             raise refuse(self, "sigma_range_m", "a positive number")
 
-    varied = by_gain_and_offset
+    varied, noisy = by_gain_and_offset, range_noise
     parameter_names: ClassVar[tuple[str, ...]] = ("gain", "offset")
 
     @property
@@ -141,14 +157,18 @@ class _Ranging(Expecting):
 
     def range_variance(self, y: Array) -> Array:
         """Return a^2 + (b range)^2 (K,) of measurements y (K, m)."""
-        return np.asarray(self.sigma_range_m**2 + (self.sigma_range_rel * y[:, 0]) ** 2)
+        return self.noise(y)[:, 0, 0]
 
     def noise(self, y: Array) -> Array:
         """Return the noise R (K, m, m) of measurements y (K, m)."""
-        R = super().noise(y)
-        if not self.additive:
-            R[:, 0, 0] = self.range_variance(y)
-        return R
+        if self.additive:
+            return super().noise(y)
+        return np.asarray(range_noise(self.noise_numbers, np.array(y, dtype=np.float64)))
+
+    @cached_property
+    def noise_numbers(self) -> Array:
+        """The constant variances (p,) of the measurements, and the part of the range's sigma that grows with it."""
+        return np.array([*self._variances, self.sigma_range_rel])
 
     def noise_at(self, v: Array) -> Array:
         """Return the noise R (K, m, m) of measuring v (K, d): of the expected range, not of the noisy one."""

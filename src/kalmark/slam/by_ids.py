@@ -40,15 +40,18 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     report.gaps, slots = moves.advance(state, name), tracks.slots_of(ids)
     if state.repeats((name, event.sensor), event.t_ns, event.y, event.ids):
         return record_repeated_reading(report, ids, channel.dof)
+    scan = ScanContext(state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report)
+    if channel.noise_at is not None:
+        R = channel.noise(state.map, moving.slot, model, slots, R, scan.own_noise)
     update = Update(
         model.model, moving.slot, channel.mount, slots, model.d, event.y, R, channel.gate, not channel.finds_depth
     )
-    scan = ScanContext(state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report)
     done = elsewhere.correct(state, scan, ids, update)
     report.e, report.z, report.Z, _, fused, _ = done
     for track, used in zip(seen, fused.tolist(), strict=True):
         track.observations += used
-    scan.add_reports(ids, range(len(ids)), fused.tolist())
+    if event.classes is not None:
+        scan.add_reports(ids, range(len(ids)), fused.tolist())
     if policy.contests and np.count_nonzero(fused) < len(fused):
         group = JudgedScan(range(len(ids)), ids, ids, done, channel.gate)
         tentative.contest(state, scan, model, group, elsewhere.misfits(state, scan, done), policy.upkeep.odds)

@@ -83,7 +83,6 @@ def policy_of(
     seen = [model.landmark for model in channel.models.values()]
     kinds = [kind.ray if isinstance(kind, AsPoint) else kind for kind in seen]
     reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
-    varies = channel.noise_at is not None or channel.robust is not None
     looks_back = channel.sees_velocity or channel.lags
     approaches = channel.far is not None or channel.depths
     return Policy(
@@ -95,7 +94,7 @@ def policy_of(
         (channel.robust is not None or association.threshold(channel.dof, 0.0) < math.inf)
         and delayed is None and (deferred is None or channel.is_ambiguous) and channel.starts_landmarks,
         type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
-        and not (reviews or varies or looks_back or approaches),
+        and not (reviews or channel.robust is not None or looks_back or approaches),
     )  # fmt: skip
 
 
