@@ -121,12 +121,8 @@ def read_measurements(
 
 def read_truth(path: Path, request: Request) -> Trajectory:
     """Return the true poses of one robot; rows of a repeated time are refused."""
-    poses: dict[int, list[float]] = {}
-    for line, t_ns, pose in timed_rows(path, ("x_m", "y_m", "theta_rad"), request.refuse):
-        if t_ns in poses:
-            request.refuse(f"{path}:{line}: time twice, expected increasing times")
-        else:
-            poses[t_ns] = pose
+    rows = timed_rows(path, ("x_m", "y_m", "theta_rad"), request.refuse, strictly=True)
+    poses = {t_ns: pose for _, t_ns, pose in rows}
     if not poses:
         raise LogError(f"{path}: no row that can be used, expected true poses")
     return Trajectory.of(poses)

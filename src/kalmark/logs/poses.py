@@ -111,18 +111,11 @@ def read_path(path: Path, request: Request) -> Trajectory:
 
 def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
     """Yield times (ns), which increase, and poses (7,)."""
-    last_ns = None
-    for line, t_ns, values in timed_rows(path, POSE3, request.refuse, plain_text(path, request)):
+    for line, t_ns, values in timed_rows(path, POSE3, request.refuse, plain_text(path, request), strictly=True):
         try:
-            q = unit_quaternion(np.array(values[3:]), ValueError)
+            yield t_ns, np.append(values[:3], unit_quaternion(np.array(values[3:]), ValueError))
         except ValueError as error:
             request.refuse(f"{path}:{line}: {error}")
-            continue
-        if t_ns == last_ns:
-            request.refuse(f"{path}:{line}: time {fixed_seconds(t_ns)} s twice, expected increasing times")
-        else:
-            last_ns = t_ns
-            yield t_ns, np.append(values[:3], q)
 
 
 def kitti_rows(path: Path, request: Request, t_ns: Times | None = None) -> Iterator[tuple[int, Array]]:

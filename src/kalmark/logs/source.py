@@ -274,53 +274,47 @@ def read_points(
     return points
 
 
-def timed_rows(
-    path: Path, names: Names, refuse: Refuse, text: str | None = None
-) -> Iterator[tuple[int, int, list[float]]]:
-    """Yield (line, t_ns, numbers) of rows `t_s, *names` whose time never runs back; bad rows go to `refuse`.
+def rows_in_time(
+    file: Path, rows: Iterable[tuple[int, list[str]]], refuse: Refuse = raise_refusal, unit: str = "s",
+    strictly: bool = True,
+) -> Iterator[tuple[int, int, list[str]]]:  # fmt: skip
+    """Yield (line, t_ns, other cells) of rows that begin with a time; one that runs back goes to `refuse`.
 
-    Raises LogError if the file is missing, empty or has no row at all.
+    So does one that stands still, if `strictly`.  Raises LogError if there is no row.
     """
-    last_ns, last_text, count = -_T_MAX_NS, "", 0
-    for line, cells in text_rows(path, text):
-        count += 1
-        if len(cells) != len(names) + 1:
-            columns = ", ".join(("t_s", *names))
-            refuse(f"{path}:{line}: {len(cells)} numbers in the row, expected {len(names) + 1}: {columns}")
-            continue
-        try:
-            t_ns, values = nanoseconds_of_text(cells[0]), [number_of_text(cell) for cell in cells[1:]]
-        except ValueError:
-            odd = next((n for n, cell in enumerate(cells) if not is_number_text(cell)), 0)
-            refuse(f"{path}:{line}: {('t_s', *names)[odd]} is {cells[odd]!r}, expected a finite number")
-            continue
-        if t_ns < last_ns:
-            refuse(f"{path}:{line}: time {cells[0]} s after {last_text} s, expected times that never run backwards")
-            continue
-        last_ns, last_text = t_ns, cells[0]
-        yield line, t_ns, values
-    if count == 0:
-        raise LogError(f"{path}:1: no rows of data, expected columns {', '.join(('t_s', *names))}")
-
-
-def increasing_times(
-    file: Path, rows: Iterable[tuple[int, list[str]]] | None = None, unit: str = "s"
-) -> Iterator[tuple[int, int, list[str]]]:
-    """Yield (line, t_ns, other cells) of the rows of a file that begin with a time, which increases.  Raises LogError.
-
-    The rows are those of white-space separated text if absent.
-    """
-    last_ns = -_T_MAX_NS
-    for line, (cell, *rest) in text_rows(file) if rows is None else rows:
+    last_ns, last, line = -_T_MAX_NS - 1, "", 0
+    wanted = "increasing times" if strictly else "times that never run backwards"
+    for line, (cell, *rest) in rows:
         try:
             t_ns = nanoseconds_of_text(cell, TIMES[f"t_{unit}"])
         except ValueError:
-            raise LogError(f"{file}:{line}: {short_text(cell)}, expected a time in {unit}") from None
-        if t_ns <= last_ns:
-            what = f"the time {cell} {unit} is not after the one before"
-            raise LogError(f"{file}:{line}: {what}, expected increasing times")
-        last_ns = t_ns
+            refuse(f"{file}:{line}: {short_text(cell)}, expected a time in {unit}")
+            continue
+        if t_ns < last_ns + strictly:
+            refuse(f"{file}:{line}: time {cell} {unit} after {last} {unit}, expected {wanted}")
+            continue
+        last_ns, last = t_ns, cell
         yield line, t_ns, rest
+    if not line:
+        raise LogError(f"{file}:1: no rows of data, expected rows that begin with a time in {unit}")
+
+
+def timed_rows(
+    path: Path, names: Names, refuse: Refuse, text: str | None = None, strictly: bool = False
+) -> Iterator[tuple[int, int, list[float]]]:
+    """Yield (line, t_ns, numbers) of rows `t_s, *names` of text, as `rows_in_time`; bad rows go to `refuse`."""
+    for line, t_ns, cells in rows_in_time(path, text_rows(path, text), refuse, strictly=strictly):
+        if len(cells) != len(names):
+            columns = ", ".join(("t_s", *names))
+            refuse(f"{path}:{line}: {len(cells) + 1} numbers in the row, expected {len(names) + 1}: {columns}")
+            continue
+        try:
+            values = [number_of_text(cell) for cell in cells]
+        except ValueError:
+            odd = next(n for n, cell in enumerate(cells) if not is_number_text(cell))
+            refuse(f"{path}:{line}: {names[odd]} is {cells[odd]!r}, expected a finite number")
+            continue
+        yield line, t_ns, values
 
 
 # ------------------------------------------------------------------ rigs: poses of other conventions, YAML files

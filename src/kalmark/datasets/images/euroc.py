@@ -23,7 +23,7 @@ from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.image_files import frames_of
 from kalmark.logs.log import Log, Names, Section, Times, Trajectory, interpolate
-from kalmark.logs.source import Format, Request, increasing_times, number_of_text, one_of, read_text
+from kalmark.logs.source import Format, Request, number_of_text, one_of, read_text, rows_in_time
 from kalmark.logs.table_columns import INERTIAL, TWIST3
 from kalmark.models.motion import noise_densities
 
@@ -120,7 +120,7 @@ def csv_of(file: Path, columns: int) -> TimedRows | None:
     if not file.is_file() and not file.with_name(f"{file.name}.gz").is_file():
         return None
     found: dict[int, list[float]] = {}
-    for line, t_ns, cells in increasing_times(file, lines_of(file), "ns"):
+    for line, t_ns, cells in rows_in_time(file, lines_of(file), unit="ns"):
         try:
             found[t_ns] = [number_of_text(cell) for cell in cells]
             if len(cells) != columns - 1:
@@ -128,8 +128,6 @@ def csv_of(file: Path, columns: int) -> TimedRows | None:
         except ValueError:
             row = short_text(",".join(cells))
             raise LogError(f"{file}:{line}: {row}, expected {columns - 1} finite numbers after the time") from None
-    if not found:
-        raise LogError(f"{file}:1: no rows of data, expected times in ns and numbers")
     return TimedRows(np.array([*found], dtype=np.int64), np.array([*found.values()]))
 
 

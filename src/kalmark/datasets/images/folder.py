@@ -26,9 +26,9 @@ from kalmark.logs.source import (
     Format,
     Request,
     frame,
-    increasing_times,
     nanoseconds_of_text,
     number_of_text,
+    rows_in_time,
     text_rows,
 )
 
@@ -128,7 +128,7 @@ def named_time(stem: str) -> int | None:
 
 def read_times(file: Path, count: int) -> list[int]:
     """Return the times (ns) of so many images: the first number of each row, in s.  Raises LogError."""
-    t_ns = [t for _, t, _ in increasing_times(file)]
+    t_ns = [t for _, t, _ in rows_in_time(file, text_rows(file))]
     if len(t_ns) != count:
         raise LogError(f"{file}: {len(t_ns)} times for {count} images, expected one each")
     return t_ns

@@ -11,7 +11,7 @@ from kalmark.events import Event, Frame
 from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.image_files import image_size
 from kalmark.logs.log import Log, Names, Section
-from kalmark.logs.source import Request, increasing_times, one_robot
+from kalmark.logs.source import Request, one_robot, rows_in_time
 
 ROBOT, CAMERA = "robot", "camera"
 MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 1.0, "sigma_w_radps_per_sqrt_s": 2.0}
@@ -65,20 +65,16 @@ def camera_log(
     return one_robot(format, path, request, ROBOT, events, controls, {}, describes=rig, **rest)
 
 
-def files_by_time(
-    folder: Path, file: Path, rows: Iterable[tuple[int, list[str]]] | None = None, unit: str = "s"
-) -> dict[int, Path]:
+def files_by_time(folder: Path, file: Path, rows: Iterable[tuple[int, list[str]]], unit: str = "s") -> dict[int, Path]:
     """Return files in a folder by their times (ns), which increase, of the rows of a file: a time and a name each.
 
     Raises LogError.
     """
     found: dict[int, Path] = {}
-    for line, t_ns, names in increasing_times(file, rows, unit):
+    for line, t_ns, names in rows_in_time(file, rows, unit=unit):
         if len(names) != 1:
             raise LogError(f"{file}:{line}: {len(names) + 1} cells, expected a time and a file")
         found[t_ns] = folder / names[0]
-    if not found:
-        raise LogError(f"{file}:1: no rows of data, expected times and files")
     return found
 
 

@@ -18,7 +18,7 @@ from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.image_files import DEPTH_SCALE, frames_of
 from kalmark.logs.log import Log, Section
 from kalmark.logs.poses import read_path
-from kalmark.logs.source import Format, Request
+from kalmark.logs.source import Format, Request, text_rows
 
 NEAR_NS = 20_000_000
 SIZE = {"width_px": 640, "height_px": 480}
@@ -43,10 +43,10 @@ def read(
     depth_scale: Annotated[float, Within(ge=1e-3), "The number of 1 m in a depth image."] = DEPTH_SCALE,
 ) -> Log:
     """Return the log.  Raises LogError."""
-    listed = files_by_time(path, path / "rgb.txt")
+    listed = files_by_time(path, path / "rgb.txt", text_rows(path / "rgb.txt"))
     depths: dict[int, Path] = {}
     if depth == "auto" and (path / "depth.txt").is_file():
-        depths = match_times([*listed], files_by_time(path, path / "depth.txt"))
+        depths = match_times([*listed], files_by_time(path, path / "depth.txt", text_rows(path / "depth.txt")))
     frames = frames_of(ROBOT, CAMERA, [*listed], [*listed.values()], request, [*map(depths.get, listed)], depth_scale)
     poses = path / "groundtruth.txt"
     truth = {ROBOT: read_path(poses, request)} if poses.is_file() else {}
