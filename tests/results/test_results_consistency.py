@@ -105,10 +105,9 @@ def test_bounds_of_an_average_narrow_with_the_number_of_runs() -> None:
 def test_a_run_has_diverged_only_if_far_in_sigmas_and_in_metres() -> None:
     P = np.broadcast_to(0.01 * np.eye(2), (2, 2, 2))
     d = np.array([[0.1, 0.0], [1.5, 0.0]])
-    error = np.linalg.norm(d, axis=1)
-    assert has_diverged(d, P, error, np.array([[0, 0], [20.0, 0]]))
-    assert not has_diverged(d, P, error, np.array([[0, 0], [100.0, 0]]))
-    assert not has_diverged(d, 100 * P, error, np.array([[0, 0], [20.0, 0]]))
+    assert has_diverged(d, d, P, np.array([[0, 0, 0], [20.0, 0, 0]]))
+    assert not has_diverged(d, d, P, np.array([[0, 0, 0], [100.0, 0, 0]]))
+    assert not has_diverged(d, d, 100 * P, np.array([[0, 0, 0], [20.0, 0, 0]]))
 
 
 def test_the_most_of_a_mean_nees_is_that_of_one_value_for_an_error_that_lasts_and_less_for_one_that_does_not() -> None:

@@ -358,6 +358,5 @@ def scores_of(
     series["position_m"], series["heading_rad"] = (np.linalg.norm(e, axis=-1) for e in (world[..., :d], world[..., d:]))
     place, true, judged, count = found
     aligned = aligned_rmse(place, true) if judged >= d else float("nan")
-    parts = zip(own[..., :d], P[..., :d, :d], series["position_m"], truth[..., :d], strict=True)
-    lost = any(has_diverged(*part) for part in parts)
+    lost = any(has_diverged(*part) for part in zip(own, world, P, truth, strict=True))
     return Scores(series, aligned, rmse(place - true), count, nis, nis_dof, lost or bool(stopped), stopped)

@@ -184,7 +184,6 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
     d = 3 if mean.shape[1] == 7 else 2
     world = pose_error(mean, truth, "world")
     own = pose_error(mean, truth, coordinates)
-    error_m = np.linalg.norm(world[:, :d], axis=1)
     return {
         "ate_m": aligned_rmse(mean[:, :d], truth[:, :d]),
         "ate_raw_m": rmse(world[:, :d]),
@@ -193,7 +192,7 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
         "pose_nees_most": nees_limit(own, P),
         "pose_nees_world": _mean(nees(world, P)),
         "path_m": path_m(truth[:, :d]),
-        "diverged": has_diverged(own[:, :d], P[:, :d, :d], error_m, truth[:, :d]),
+        "diverged": has_diverged(own, world, P, truth),
     }
 
 
@@ -222,7 +221,7 @@ def free_scale_figures(mean: Array, P: Array, truth: Array) -> Figures:
     error = fit(scale * mean[:, :3]) - truth[:, :3]
     turn = scale * fit.rotation
     sigmas = turn @ P[:, :3, :3] @ turn.T
-    lost = has_diverged(error, sigmas, np.linalg.norm(error, axis=1), truth[:, :3])
+    lost = has_diverged(error, error, sigmas, truth)
     return {"pose_nees": None, "pose_nees_most": None, "pose_nees_world": None, "diverged": lost}
 
 

@@ -370,11 +370,13 @@ def anees_interval(dof: float, runs: float = 1, probability: float = 0.95) -> tu
     return float(quantile(tail, dof * runs)) / runs, float(quantile(1.0 - tail, dof * runs)) / runs
 
 
-def has_diverged(d: Array, P: Array, error_m: Array, truth: Array) -> bool:
+def has_diverged(own: Array, world: Array, P: Array, truth: Array) -> bool:
     """Return whether the position error ever exceeds 10 of its own sigmas and 5 % of the path.
 
-    `d` (N, 2 or 3) is the position error in the estimator's coordinates, `P` its covariance, `error_m` (N,) its
-    length in metres, `truth` (N, 2 or 3) the true path.  Sigmas are counted as the Mahalanobis distance.
+    Errors (N, 2 or more) of true poses (N, 3 or 7) begin with those of the position: `own` in the estimator's
+    coordinates, with covariances P (N, 2 or more, 2 or more), `world` in m.  Sigmas are counted as the Mahalanobis
+    distance.
     """
-    far = np.sqrt(nees(d, P)) > DIVERGED_SIGMAS
-    return bool(np.any(far & (error_m > DIVERGED_PATH * path_m(truth))))
+    d = 2 if truth.shape[1] == 3 else 3
+    far = np.sqrt(nees(own[:, :d], P[:, :d, :d])) > DIVERGED_SIGMAS
+    return bool(np.any(far & (np.linalg.norm(world[:, :d], axis=1) > DIVERGED_PATH * path_m(truth[:, :d]))))
