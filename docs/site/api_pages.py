@@ -7,6 +7,7 @@ configuration follow from the declaration.
 import ast
 import inspect
 import sys
+from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from itertools import pairwise
@@ -16,7 +17,7 @@ from typing import Any, get_origin
 from docstrings import plain_names, rst, signature_of
 
 import kalmark as km
-from kalmark.declare import is_own, parameters, registered_name, world_of_class
+from kalmark.declare import Parameter, declared_options, is_own, registered_name, world_of_class
 
 # shown as, module, of what
 PARTS = [
@@ -223,6 +224,7 @@ def _class(name: str, thing: type) -> list[str]:
     named = registered_name(thing)
     if named and is_own(thing):
         return told + _model(name, thing, named)
+    told += [line and f"   {line}" for line in "\n".join(_table(declared_options(thing))).splitlines()] + [""]
     own = [each for each in thing.__mro__ if each.__module__.startswith("kalmark")]
     members = {key: member for each in reversed(own) for key, member in vars(each).items() if not key.startswith("_")}
     for key, member in members.items():
@@ -247,15 +249,24 @@ def _model(name: str, thing: Any, named: str) -> list[str]:
     what = "Control" if hasattr(made, "move") else "Measurement"
     where = {"plane": "in the plane", "space": "in space"}.get(world_of_class(thing), "")
     facts = "; ".join(filter(None, [f"{what}: {columns}" if columns else "", where]))
-    declared = [each for each in parameters(thing) if each.text]
+    declared = declared_options(thing)
     some = [p for p in declared if isinstance(p.default, int | float) and p.default != float("inf")][:2]
     home = next((shown for _, shown, module in PARTS if getattr(import_module(module), name, None) is thing), "km")
     keys = "".join(f", {p.name}: {str(p.default).lower() if isinstance(p.default, bool) else p.default}" for p in some)
     told = [facts[:1].upper() + facts[1:] + "." if facts else "", "", ".. code-block:: python", ""]
     call = f"{home.replace('kalmark', 'km', 1)}.{name}({', '.join(f'{p.name}={p.default!r}' for p in some)})"
     told += [f"   {call}", "", "In a configuration:", "", ".. code-block:: yaml", "", f"   {{type: {named}{keys}}}", ""]
-    rows = [(f"``{p.name}``", _default(p.default), p.unit, rst(f"{p.text}  Expected: {p.wanted}.")) for p in declared]
-    return [*told, _list(rows, ("parameter", "default", "unit", "meaning"))] if rows else told
+    return told + _table(declared)
+
+
+def _table(declared: Sequence[Parameter]) -> list[str]:
+    """Return the table of parameters, none of no parameters."""
+    told = [p.on_a_line.partition(f": {p.text}") for p in declared]
+    rows = [
+        (f"``{p.name}``", "" if p.role else _default(p.default), p.unit, rst(p.text + expected))
+        for p, (_, _, expected) in zip(declared, told, strict=True)
+    ]
+    return [_list(rows, ("parameter", "default", "unit", "meaning"))] if rows else []
 
 
 def _default(value: Any) -> str:

@@ -27,16 +27,17 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 import numpy as np
 
 from kalmark.errors import KalmarkError, ModelError, PluginError
-from kalmark.events import bound, largest_magnitude, short_text
+from kalmark.events import MOST, bound, largest_magnitude, short_text
 from kalmark.geometry.spaces import Space
 from kalmark.plugins import load_all
 
 __all__ = [
-    "Count", "Estimated", "Limit", "NotNegative", "Number", "Parameter", "Positive", "Probability", "Values", "Within",
-    "declared", "parameters", "register",
+    "Count", "Estimated", "Limit", "NotNegative", "Number", "Parameter", "Positive", "Probability", "Role", "Values",
+    "Within", "declared", "parameters", "register",
 ]  # fmt: skip
 
 Class = TypeVar("Class", bound=type)
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 UNITS = {
     "_mps2_per_sqrt_s": "m/s^2/sqrt(s)",
@@ -85,6 +86,10 @@ class Within:
             return False
         return all(vars(operator)[name](value, limit) for name, limit in self.limits.items())
 
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        """Return how pydantic validates a number of a section: within, and no larger than a distance may be."""
+        return handler(source) | {"ge": -MOST["m"], "le": MOST["m"]} | self.limits
+
     def words(self, kind: str) -> str:
         """Return what is expected: `kind` is "number" or "whole number"."""
         if self.lt is not None and self.gt is not None:
@@ -129,6 +134,17 @@ class Values:
 
 
 @dataclass(frozen=True)
+class Role:
+    """The value is a model of this role, which its owner checks.
+
+    >>> Role("landmark")
+    Role(name='landmark')
+    """
+
+    name: str
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A field of a model, or an option: `type` is without None and without the `words` that it may be instead.
 
@@ -145,6 +161,7 @@ class Parameter:
     within: Within
     text: str
     values: Values | None = None
+    role: str = ""
 
     @property
     def unit(self) -> str:
@@ -154,6 +171,8 @@ class Parameter:
     @property
     def wanted(self) -> str:
         """The expected value, in words."""
+        if self.values is not None:
+            return "a mapping"
         if self.type is None:
             return f"one of {', '.join(self.words)}"
         number = self.within.words("whole number" if self.type is int else "number")
@@ -163,8 +182,9 @@ class Parameter:
     @property
     def on_a_line(self) -> str:
         """The parameter on a line: name, default, unit, meaning and bounds."""
-        default = "" if self.default is None else f" = {self.default!r}"
-        return f"{self.name}{default}{self.unit and f' [{self.unit}]'}: {self.text}  Expected: {self.wanted}."
+        default = "" if self.default is None or self.role else f" = {self.default!r}"
+        expected = "" if self.type is Any else f"  Expected: {self.wanted}."
+        return f"{self.name}{default}{self.unit and f' [{self.unit}]'}: {self.text}{expected}"
 
     def refused(self, value: Any) -> str:
         """Return what a value is to be instead, nothing if it is that."""
@@ -197,8 +217,8 @@ class Parameter:
                 return "a list of texts" if kind is str else "a list of finite numbers"
             return f"{size} numbers, each {one.wanted}"
         if self.values is not None:
-            return "" if isinstance(value, Mapping) else "a mapping"
-        return "" if self.type is Any else self.wanted
+            return "" if isinstance(value, Mapping) else self.wanted
+        return self.wanted if self.type is None else ""
 
 
 def unit_of(name: str) -> str:
@@ -206,8 +226,8 @@ def unit_of(name: str) -> str:
     return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
 
 
-def parameters(model: type) -> tuple[Parameter, ...]:
-    """Return the parameters of a model's class, () if it is no dataclass.
+def parameters(model: Any) -> tuple[Parameter, ...]:
+    """Return the parameters of a model's class, () if it is no dataclass, or of a function.
 
     >>> [one.name for one in parameters(km.sensors.Bearing)][:2]
     ['sigma_bearing_rad', 'range_min_m']
@@ -217,18 +237,19 @@ def parameters(model: type) -> tuple[Parameter, ...]:
 
 @cache
 def _parameters(model: Any) -> tuple[Parameter, ...]:
-    if not dataclasses.is_dataclass(model):
-        return ()
     hints = _hints(model)
-    fields = sorted((field for field in dataclasses.fields(model) if field.init), key=lambda field: bool(field.kw_only))
-    return tuple(_parameter(field.name, field.default, hints.get(field.name, Any)) for field in fields)
-
-
-def options_of(function: Callable[..., Any], after: int) -> tuple[Parameter, ...]:
-    """Return the parameters of a function behind the first ones, declared as those of a model are."""
-    hints = _hints(function)
-    named = [*inspect.signature(function).parameters.values()][after:]
+    named: list[Any] = []
+    if dataclasses.is_dataclass(model):
+        named = [field for field in dataclasses.fields(model) if field.init]
+        named.sort(key=lambda field: bool(field.kw_only))
+    elif not isinstance(model, type):
+        named = [*inspect.signature(model).parameters.values()]
     return tuple(_parameter(each.name, each.default, hints.get(each.name, Any)) for each in named)
+
+
+def declared_options(of: Any) -> tuple[Parameter, ...]:
+    """Return the parameters of a class or a function that have a line of documentation: the options of a robot."""
+    return tuple(each for each in parameters(of) if each.text)
 
 
 def _hints(of: Any, include_extras: bool = True) -> dict[str, Any]:
@@ -244,31 +265,37 @@ def _parameter(name: str, default: Any, hint: Any) -> Parameter:
     words = tuple(word for part in parts if get_origin(part) is Literal for word in get_args(part))
     kinds = [part for part in parts if part is not NoneType and get_origin(part) is not Literal]
     bounds = next((extra for extra in extras if isinstance(extra, Within)), Within(infinite=True))
+    role = next((extra.name for extra in extras if isinstance(extra, Role)), "")
     return Parameter(
         name,
-        kinds[0] if len(kinds) == 1 else Any if kinds else None,
+        kinds[0] if len(kinds) == 1 and not role else Any if kinds else None,
         None if default in (dataclasses.MISSING, inspect.Parameter.empty) else default,
         NoneType in parts,
         words,
         bounds,
         "".join(extra for extra in reversed(extras) if isinstance(extra, str)),
         next((extra for extra in extras if isinstance(extra, Values)), None),
+        role,
     )
 
 
-def refuse(model: Any, key: str, wanted: str) -> ModelError:
-    """Return the error of a model's parameter that is not what is `wanted`, which has `key` and `wanted`, too."""
-    error = ModelError(f"{type(model).__name__}: {key} is {short_text(vars(model)[key])}, expected {wanted}")
+def refuse(model: Any, key: str, wanted: str, what: str | None = None) -> ModelError:
+    """Return the error of a model's parameter that is not what is `wanted`, which has `key` and `wanted`, too.
+
+    The message begins with `what`, or with the name of the model's class.
+    """
+    begin = f"{type(model).__name__}: " if what is None else what
+    error = ModelError(f"{begin}{key} is {short_text(vars(model)[key])}, expected {wanted}")
     error.key, error.wanted = key, wanted
     return error
 
 
-def check_parameters(model: Any) -> None:
-    """Refuse a model with a parameter that is not as declared.  Raises ModelError."""
+def check_parameters(model: Any, what: str | None = None) -> None:
+    """Refuse a model, `what` in the message, with a parameter that is not as declared.  Raises ModelError."""
     for parameter in parameters(type(model)):
         wanted = parameter.refused(vars(model)[parameter.name])
         if wanted:
-            raise refuse(model, parameter.name, wanted)
+            raise refuse(model, parameter.name, wanted, what)
 
 
 def summary(model: type) -> str:
@@ -280,9 +307,12 @@ class _Readable:
     """The signature of a declared class, its types without bounds and texts.  It is made when it is read."""
 
     def __get__(self, instance: Any, model: Any) -> inspect.Signature:
-        types = _hints(model, include_extras=False)
-        _, *named = inspect.signature(model.__init__).parameters.values()
-        return inspect.Signature([each.replace(annotation=types.get(each.name, each.empty)) for each in named])
+        types, is_class = _hints(model, include_extras=False), dataclasses.is_dataclass(model)
+        named = [*inspect.signature(model.__init__ if is_class else model).parameters.values()][is_class:]
+        return inspect.Signature(
+            [each.replace(annotation=types.get(each.name, each.empty)) for each in named],
+            return_annotation=types.get("return", inspect.Signature.empty),
+        )
 
 
 @dataclass(frozen=True)
@@ -291,8 +321,8 @@ class _Documented:
 
     text: str
 
-    def __get__(self, instance: Any, model: type) -> str:
-        rows = [each.on_a_line for each in parameters(model) if each.text]
+    def __get__(self, instance: Any, model: Any) -> str:
+        rows = [each.on_a_line for each in declared_options(model)]
         name = registered_name(model)
         named = f"  In a configuration: `type: {name}`." if name else ""
         return "\n    ".join([f"{inspect.cleandoc(self.text)}\n\nParameters.{named}\n", *rows]) if rows else self.text
@@ -321,8 +351,18 @@ def declared(model: Class) -> Class:
         _CHECKS.add(__post_init__)
         model.__post_init__ = __post_init__  # type: ignore[attr-defined]
     made: Any = dataclass(frozen=True)(model)
-    made.__init__.__annotations__, made.__signature__, made.__doc__ = {}, _Readable(), _Documented(made.__doc__)
-    return made
+    return documented(made)
+
+
+def documented(of: Function) -> Function:
+    """Show the parameters of a dataclass, or of a function, by `help`: their bounds and texts below its docstring."""
+    made: Any = of
+    signature, doc = _Readable(), _Documented(made.__doc__)
+    if dataclasses.is_dataclass(of):
+        made.__init__.__annotations__, made.__signature__, made.__doc__ = {}, signature, doc
+    else:
+        made.__signature__, made.__doc__ = signature.__get__(None, of), doc.__get__(None, of)
+    return of
 
 
 # ------------------------------------------------------------------ names
@@ -381,6 +421,11 @@ def classes(role: str, world: str = "") -> dict[str, list[type]]:
 def built_in(role: str) -> tuple[Any, ...]:
     """Return the classes of a role that are kalmark's own."""
     return tuple(model for models in _CLASSES.get(role, {}).values() for model in models if is_own(model))
+
+
+def has_one_model(role: str) -> bool:
+    """Return whether a role has one model, which has its name: its section has no `type`."""
+    return role in _CLASSES.get(role, {})
 
 
 def class_of(role: str, name: str, world: str = "") -> type:

@@ -27,14 +27,13 @@ Id = int | str
 
 FLOAT = np.dtype(np.float64)
 LATEST_NS = 2**63  # times are int64: about 292 years either side of 0
-LONGEST_PAUSE_S = 12 * 3600.0  # between two events: what comes later has a wrong stamp
 LONGEST = 80  # characters of a value in a message
 LONGEST_ID = 200  # characters or digits of a landmark's id
 ROUNDED = 1e-3  # a quaternion is of length 1, and a matrix a rotation, up to this: files have few digits
 _SHORT = 2**63  # ids that need no second look
 
-MOST = {"m": 1e9, "mps": 1e6, "rad": 1e6, "radps": 1e6, "px": 1e9}
-"""The largest magnitudes that mean anything, by unit: m, m/s, rad, rad/s and pixels.
+MOST = {"m": 1e9, "mps": 1e6, "rad": 1e6, "radps": 1e6, "px": 1e9, "ns": LATEST_NS}
+"""The largest magnitudes that mean anything, by unit: m, m/s, rad, rad/s, pixels and times.
 
 A larger number leaves no digits for the rest of a map: a double that holds 1e9 m resolves 1e-7 m.
 """

@@ -135,7 +135,7 @@ def test_a_robust_sensor_is_described_saved_and_refused_where_it_is_none(tmp_pat
     slam = km.Slam([km.Robot("r", km.motion.Unicycle(), sensors={"l": km.Mount(LASER, robust="huber")})])
     slam.save(tmp_path / "map.kmk")
     assert km.Slam.load(tmp_path / "map.kmk").robots["r"].sensors["l"].robust == "huber"
-    with pytest.raises(ModelError, match="robust is 'tukey', expected huber or student, or None"):
+    with pytest.raises(ModelError, match="robust is 'tukey', expected one of huber, student"):
         km.Mount(LASER, robust="tukey")
     with pytest.raises(ModelError, match="a Heading measures its robot, expected None"):
         km.Mount(km.sensors.Heading(), robust="huber")

@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -17,15 +17,14 @@ import pytest
 import kalmark as km
 from kalmark.cli import main
 from kalmark.config import load_config, slam_described
-from kalmark.config.schema import Config, MapConfig, PlaneMounted, RobotConfig
-from kalmark.config.sections import Choice, model_of, section_of
-from kalmark.declare import Parameter, built_in, class_of, parameters, registered_name, world_of_class
+from kalmark.config.sections import Choice, model_of
+from kalmark.declare import Parameter, built_in, class_of, declared_options, parameters, world_of_class
 from kalmark.errors import ConfigError, KalmarkError, ModelError
 from kalmark.geometry.rotations import from_euler
 from kalmark.models.landmark_views import Raised
 from kalmark.results.filter_description import configuration
 from kalmark.results.recording import config_yaml
-from kalmark.slam.description import OF_PLACE, describe, describe_model
+from kalmark.slam.description import describe, describe_model
 from kalmark.slam.state import Settings
 
 ROLES = (
@@ -33,12 +32,8 @@ ROLES = (
     *("detector", "initialization", "attention", "upkeep", "classes"),
 )
 MODELS = [(role, each) for role in ROLES for each in built_in(role)]
-SECTIONS: dict[Any, dict[str, Any]] = {
-    km.Robot: RobotConfig.model_fields,
-    km.Mount: PlaneMounted.model_fields | section_of("sensor", "range_bearing", "plane").model_fields,
-    Settings: Config.model_fields | MapConfig.model_fields | {"map": MapConfig.model_fields["type"]},
-}
-OPTIONS = [(kind, field.name) for kind in SECTIONS for field in fields(kind) if field.name not in OF_PLACE]
+KINDS = (km.Robot, km.Mount, Settings)
+OPTIONS = [(kind, option.name) for kind in KINDS for option in declared_options(kind) if option.role != "motion"]
 SENSORS = (km.sensors.RangeBearing(), km.sensors.Bearing(), km.sensors.Range())
 PLACES = np.array([(1.0, -2.0), (4.0, -1.0), (3.0, 1.0)])  # by increasing bearing
 AT_3D = (0.1, -0.2, 0.3, *from_euler(np.array([0.3, -0.4, 2.0]))[0])
@@ -73,22 +68,19 @@ def changed(kind: Any, name: str) -> Any:
     raise AssertionError(f"{kind.__name__}: no other value of {name} is taken")
 
 
-def candidates(annotation: Any) -> Iterator[Any]:
-    """Yield what a key of a configuration may be: its words, its models, some numbers."""
-    for part in (annotation, *get_args(annotation)):
-        if get_origin(part) is Literal:
-            yield from get_args(part)
-        elif isinstance(part, Choice):
-            kinds = [class_of(part.role, name, "plane") for name in part.names()]
-            yield from (changed(kind, own.name) for kind in kinds for own in parameters(kind)[:1])
-        elif part is not annotation:
-            yield from candidates(part)
-    yield from (2, 1.5)
+def candidates(option: Parameter) -> Iterator[Any]:
+    """Yield what an option may be: models of its role, or values."""
+    if option.role:
+        fitting = Choice(option.role, "plane", type(SENSORS[0]) if option.role == "detector" else None)
+        kinds = [class_of(option.role, name, "plane") for name in fitting.names()]
+        yield from (changed(kind, own.name) for kind in kinds for own in parameters(kind)[:1])
+    else:
+        yield from values(option)
 
 
 def built(kind: Any, given: dict[str, Any]) -> km.Slam:
     """Return a Slam of one robot with one sensor, which has these options of the robot, the mount or the Slam."""
-    options = {each: given if each is kind else {} for each in SECTIONS}
+    options = {each: given if each is kind else {} for each in KINDS}
     for sensor in SENSORS:
         try:
             mount = km.Mount(sensor, **options[km.Mount])
@@ -102,9 +94,9 @@ def built(kind: Any, given: dict[str, Any]) -> km.Slam:
 
 def with_option(kind: Any, name: str) -> tuple[km.Slam, Any]:
     """Return a Slam with another value of an option than its default, and this value."""
-    field, section = next(each for each in fields(kind) if each.name == name), SECTIONS[kind][name]
-    for value in itertools.chain(*map(candidates, (*section.metadata, section.annotation))):
-        if value != field.default:
+    option = next(each for each in declared_options(kind) if each.name == name)
+    for value in candidates(option):
+        if value != option.default:
             try:
                 return built(kind, {name: value}), value
             except (KalmarkError, TypeError):
@@ -142,7 +134,7 @@ def test_every_parameter_of_every_model_is_read_again(role: str, kind: Any) -> N
         said = describe_model(made)
         if isinstance(made, Raised) and said.pop("height_m"):  # it is `mount.z_m`
             continue
-        section = Choice(role, world_of_class(kind), typed=registered_name(kind) != role).validated(said)
+        section = Choice(role, world_of_class(kind)).validated(said)
         assert model_of(section, world) == made, own.name
 
 
@@ -182,7 +174,9 @@ def test_a_readable_key_that_does_not_fit_the_exact_one_is_refused(tmp_path: Pat
     path.write_text(text)
     assert km.Slam.from_config(path).mean("r")[0] == 0.5
     for key, what in (("yaw_deg", "quaternion"), ("sigma_position_m", "cov")):
-        with pytest.raises(ConfigError, match=rf"robots.r.start.{key}: got 7.0, expected .* {what}.* says, or none"):
+        with pytest.raises(
+            ConfigError, match=rf"robots.r.start.{key}: got 7.0, expected .* by its .*{what}.*, or none"
+        ):
             slam_described(load_config(path, [f"robots.r.start.{key}=7.0"]).model_dump(exclude_unset=True))
 
 

@@ -104,7 +104,7 @@ def test_a_gap_that_is_ignored_is_reported_all_the_same() -> None:
 
 
 def test_what_is_no_way_to_take_a_gap_is_refused() -> None:
-    with pytest.raises(ModelError, match="gaps is 'bridge', expected refuse, widen or ignore"):
+    with pytest.raises(ModelError, match="gaps is 'bridge', expected one of refuse, widen, ignore"):
         odometer(gaps="bridge")
     with pytest.raises(ModelError, match="max_speed_mps is -1"):
         odometer(max_speed_mps=-1.0)

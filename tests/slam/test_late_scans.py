@@ -94,9 +94,13 @@ def test_a_saved_filter_goes_on_bit_for_bit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("sensor", "given", "why"),
     [
-        (km.sensors.RangeBearing(), {"lag_s": "late"}, "lag_s is 'late', expected seconds"),
-        (km.sensors.RangeBearing(), {"sigma_lag_s": -0.1}, "sigma_lag_s is -0.1, expected seconds"),
-        (km.sensors.RangeBearing(), {"lag_s": 100.0}, "at most 2"),
+        (km.sensors.RangeBearing(), {"lag_s": "late"}, "lag_s is 'late', expected a number"),
+        (
+            km.sensors.RangeBearing(),
+            {"sigma_lag_s": -0.1},
+            "sigma_lag_s is -0.1, expected a number of at least 0 up to 2",
+        ),
+        (km.sensors.RangeBearing(), {"lag_s": 100.0}, "lag_s is 100.0, expected a number of at least -2 up to 2"),
         (km.sensors.Gyro2D(), {"sigma_lag_s": 0.1}, "a Gyro2D measures its robot"),
     ],
 )

@@ -99,10 +99,9 @@ def test_a_bad_event_is_refused_with_one_line_and_changes_nothing(name: str) -> 
         (lambda: km.Slam(rover(), estimator=km.estimators.Ekf), "estimator is the class Ekf, expected an instance"),
         (lambda: km.Slam(rover(), landmarks="point"), "landmarks is 'point', expected a landmark model"),
         (lambda: km.Slam(rover(), upkeep="merge"), "upkeep is 'merge', expected an Upkeep"),
-        (
-            lambda: km.Slam(rover(), reparametrize="off"),
-            "reparametrize is 'off', expected a number of at least 0, or No",
-        ),
+        (lambda: km.Slam(rover(), reparametrize="off"), "reparametrize is 'off', expected a number"),
+        (lambda: km.Slam(rover(), reparametrize=-1), "reparametrize is -1, expected a number of at least 0"),
+        (lambda: km.Slam(rover(), map="sparse"), "map is 'sparse', expected one of auto, dense, postponed"),
         (lambda: km.Slam(rover()).covariance(), "covariance of no blocks, expected names of robots"),
         (lambda: km.Slam(rover()).covariance(["rover"]), "['rover'] is not in the map, expected 'rover' or one of"),
         (lambda: km.Slam(rover()).remove(["rover"]), "['rover'] is not in the map"),

@@ -17,7 +17,7 @@ from kalmark.config.schema import TRUTH, Config, SpaceStartConfig
 from kalmark.config.sections import ModelSection, model_of
 from kalmark.config.tree import EACH, KeyPath, Tree, quote_value
 from kalmark.config.true_start import true_start
-from kalmark.declare import built_in, registered_name
+from kalmark.declare import built_in, declared_options, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Frame, Raw, Scan
@@ -32,7 +32,7 @@ from kalmark.models.landmarks import PointHeight2D
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import state_columns
 from kalmark.picture_options import USUAL, Picture
-from kalmark.slam.description import EXACT, OF_PLACE, covariance_of, describe_place, state_of
+from kalmark.slam.description import EXACT, covariance_of, describe_place, state_of
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
 from kalmark.slam.state import Settings
@@ -56,7 +56,8 @@ def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
     config = config if log is None else with_log_description(config, log)
     robots = given.pop("robots", None) or [build_robot(config, name, log) for name in _names(config, log)]
     m = config.map
-    kept = {"map": m.type, "numbers": m.numbers, "reparametrize": m.linearity}
+    linear = None if m.reparametrize == "off" else m.reparametrize
+    kept = {"map": m.type, "numbers": m.numbers, "reparametrize": linear}
     for each in fields(Settings):
         if each.name not in (*kept, *given):
             made = _part(config, (each.name,), getattr(config, each.name), robots[0].motion.space.world)
@@ -168,8 +169,8 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     if log is not None:
         refuse_scans(config, key, name, mounts, log)
         refuse_uncalibrated(config, key, name, log)
-    own = {each.name: getattr(robot, each.name) for each in fields(Robot) if each.name not in OF_PLACE} | rests
-    return _made(config, path, Robot, name, moves, start=start, sensors=mounts, cov=cov, **own)
+    own = {each.name: getattr(robot, each.name) for each in declared_options(Robot)} | rests | {"motion": moves}
+    return _made(config, path, Robot, name, start=start, sensors=mounts, cov=cov, **own)
 
 
 def _names(config: Config, log: Log | None) -> list[str]:
@@ -234,7 +235,7 @@ def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov
 
 
 def _mount(config: Config, path: KeyPath, sensor: Any, world: str) -> Mount:
-    own = {each.name: getattr(sensor, each.name) for each in fields(Mount) if each.name not in OF_PLACE}
+    own = {each.name: getattr(sensor, each.name) for each in declared_options(Mount)}
     if sensor.initialization.type == "immediate":
         del own["initialization"]
     parts = {name: _part(config, (*path, name), part, world) for name, part in own.items() if part is not None}

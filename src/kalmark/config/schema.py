@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -14,38 +15,28 @@ from kalmark.config.sections import (
     Choice,
     Linearity,
     ModelSection,
-    NotNegative,
-    Number,
-    Positive,
     RobotName,
     Section,
     Sigmas,
     annotation,
     model_of,
-    section_of,
+    options_section,
     unexpected_value,
     unknown_key,
 )
 from kalmark.config.tree import OVERRIDE, KeyPath, name_of, place_around
-from kalmark.declare import classes, register, registered_name
+from kalmark.declare import NotNegative, Number, classes, declared_options, register, registered_name
 from kalmark.errors import ConfigError
-from kalmark.events import LONGEST_PAUSE_S
 from kalmark.geometry.named_poses import world_of
 from kalmark.logs import known_formats
+from kalmark.logs.formats import OPTIONS
 from kalmark.logs.source import Format
 from kalmark.models.protocols import state_columns
 from kalmark.slam.description import STATES, sigma_of, state_names
+from kalmark.slam.robot import Mount, Robot
+from kalmark.slam.state import Settings
 
-Motion = Annotated[Any, Choice("motion")]
-Estimator = Annotated[Any, Choice("estimator", default="invariant")]
-Landmark = Annotated[Any, Choice("landmark", default="point")]
-Association = Annotated[Any, Choice("association", default="identity")]
-Initialization = Annotated[Any, Choice("initialization", default="immediate")]
-Detector = Annotated[Any, Choice("detector")]
-Attention = Annotated[Any, Choice("attention", typed=False)]
-Upkeep = Annotated[Any, Choice("upkeep", typed=False)]
-Classes = Annotated[Any, Choice("classes", typed=False)]
-Picture = Annotated[Any, Choice("picture", typed=False)]
+Picture = Annotated[Any, Choice("picture")]
 
 Plugins = Annotated[KeyPath, Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
@@ -199,29 +190,12 @@ Preset = Literal[
 ]
 
 
-class Mounted(ModelSection):
+OF_SENSOR: Any = options_section(declared_options(Mount), ModelSection, attention=None, initialization="immediate")
+
+
+class Mounted(OF_SENSOR):  # type: ignore[misc]
     """Keys of every sensor of any type; and a `mount`, see below."""
 
-    landmark: Landmark | None = None
-    """Landmark type of this sensor; `landmarks` if absent.  A camera with a calibrated mount requires anchored ones."""
-    association: Association | None = None
-    """Association of this sensor; the configuration's `association` if absent."""
-    attention: Attention | None = None
-    """Selection of the landmarks of a scan; all if absent."""
-    upkeep: Upkeep | None = None
-    """Confirmation of landmarks; the configuration's `upkeep` if absent."""
-    detector: Detector | None = None
-    """Detector of landmarks in raw scans: one that finds what the sensor measures."""
-    initialization: Initialization = section_of("initialization", "immediate")()
-    """Start landmarks at first sight, or late; late ones are points."""
-    robust: Literal["huber", "student"] | None = None
-    """Robust weight of outliers: bounded, or nearly zero.  All observations count in full if absent."""
-    lag_s: Number = 0.0
-    """Time by which the stamps of its scans are late."""
-    sigma_lag_s: NotNegative = 0.0
-    """Standard deviation of the lag; above 0 it is in the map and is estimated."""
-    classes: Classes | None = None
-    """Classes that the sensor reports of landmarks, as colours; none if absent."""
     preset: Preset | None = None
     """Take what is not given from a documented sensor of this type: docs/presets.md."""
 
@@ -283,39 +257,20 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
 BySensor = dict[str, Number | dict[str, Number | dict[str, Number]]]
 
 
-class LogConfig(Section):
+Files = str | dict[str, str] | None
+OF_LOG: Any = options_section(
+    OPTIONS.values(), kinds={
+        "path": str | None,
+        "robots": Annotated[tuple[RobotName, ...], Field(strict=False)] | None,
+        "truth": Files, "fixes": Files, "factors": BySensor | None, "shift_s": BySensor | None,
+    }, increments="cut",
+)  # fmt: skip
+
+
+class LogConfig(OF_LOG):  # type: ignore[misc]
     """Log, robots and time to read, and the options of its format, see below."""
 
     model_config = ConfigDict(extra="allow")
-
-    path: str | None = None
-    """Folder or file; beside this file, in KALMARK_DATA or downloaded."""
-    format: str | None = None
-    """Format of the log; recognised if absent."""
-    robots: Annotated[tuple[RobotName, ...], Field(strict=False)] | None = None
-    """Use only these robots, by name or number."""
-    from_s: Number | None = None
-    """Start here, counted from the first event of the log."""
-    to_s: Number | None = None
-    """End here, counted from the first event of the log."""
-    on_error: Literal["raise", "skip"] = "raise"
-    """Action on bad input: refuse, or leave out."""
-    ids: Literal["given", "hidden"] = "given"
-    """`hidden`: the filter gets no ids of landmarks; the summary has its rate of wrong associations."""
-    truth: str | dict[str, str] | None = None
-    """A file of true poses in the format of TUM or KITTI, to score against; by robot if there are several."""
-    fixes: str | dict[str, str] | None = None
-    """The same, of positions that the filter is given, as fixes."""
-    sigma_fixes_m: Positive | None = None
-    """Noise of each coordinate of `fixes`."""
-    sigma_fixes_z_m: Positive | None = None
-    """Noise of their heights; `sigma_fixes_m` if absent."""
-    factors: BySensor | None = None
-    """Factors of columns, also of one robot or sensor: `{w_radps: -1, laser: {range_m: .001}}`; `t_s`: of all times."""
-    shift_s: BySensor | None = None
-    """Added to the times of the scans of a sensor, by its name; of one robot: `{rover: {laser: .1}}`."""
-    increments: Literal["recorded", "cut"] = "cut"
-    """`cut`: a scan between the ends of two increments cuts the second, and finds its robot where it was then."""
 
     @model_validator(mode="before")
     @classmethod
@@ -345,18 +300,10 @@ def options_of_formats(formats: tuple[Format, ...]) -> type[Section]:
     return create_model("LogOptions", __base__=Section, **fields)
 
 
-class _AnyRobot(Section):
-    motion: Motion = section_of("motion", "unicycle")()
-    """Motion model."""
-    gaps: Literal["refuse", "widen", "ignore"] = "widen"
-    """Controls that stop: refuse the log, widen the covariance by what the robot may have moved, or ignore it."""
-    max_speed_mps: Positive | None = None
-    """Greatest speed in a gap; from the controls so far if absent."""
-    max_turn_radps: Positive | None = None
-    """Greatest turn rate in a gap; from the controls so far if absent."""
-    rests_until_ns: int | None = None
-    """Controls up to this time do not move the robot; by `start.at_rest` if absent."""
+OF_ROBOT: Any = options_section(declared_options(Robot), motion="unicycle")
 
+
+class _AnyRobot(OF_ROBOT):  # type: ignore[misc]
     @model_validator(mode="after")
     def _start_fits(self) -> Self:
         robot: Any = self
@@ -398,25 +345,20 @@ AnyRobot = Annotated[
 TRUTH = "truth"  # what stands for a file with the true landmarks
 
 
-class MapConfig(Section):
-    """Storage of the covariance."""
+SETTINGS = {each.name: each for each in declared_options(Settings)}
+OF_MAP: Any = options_section(
+    [replace(SETTINGS["map"], name="type"), SETTINGS["numbers"], SETTINGS["reparametrize"]],
+    kinds={"reparametrize": Linearity},
+)
 
-    type: Literal["auto", "dense", "postponed"] = "auto"
-    """`dense` corrects the whole covariance at once, `postponed` only what is in view, `auto` is dense while small."""
-    numbers: Literal["float64", "float32"] = "float64"
-    """In what a postponed map keeps what is at rest; `float32` takes half the memory."""
-    reparametrize: Linearity = 0.03
-    """Inverse-depth and anchored points become Euclidean below this linearity index; or off."""
+
+class MapConfig(OF_MAP):  # type: ignore[misc]
+    """Storage of the covariance."""
 
     known: str | None = None
     """Landmarks known: a landmarks.csv or tagslam.yaml, beside this file or in KALMARK_DATA; `truth`: of the log."""
     exact: bool = False
     """Take the landmarks of `known` as exact, without the columns cov_... of the file."""
-
-    @property
-    def linearity(self) -> float | None:
-        """The linearity index, None for off."""
-        return None if isinstance(self.reparametrize, str) else self.reparametrize
 
 
 def _each() -> dict[str, AnyRobot]:
@@ -440,16 +382,7 @@ class OfFile(Section):
         return name_of(self._file, self.called)
 
 
-class Config(OfFile):
-    """Everything that decides a run.  A saved run's config.yaml is one of these and can be run again.
-
-    >>> config = load_config("native", ["association.type=auto"])
-    >>> isinstance(config, Config), list(config.robots), config.association.type
-    (True, ['each'], 'auto')
-    """
-
-    called: ClassVar[str] = "config"
-
+class _Head(OfFile):
     version: str | None = None
     """kalmark version that saved this file."""
     seed: int | None = None
@@ -460,20 +393,28 @@ class Config(OfFile):
     """The log."""
     robots: dict[str, AnyRobot] = Field(default_factory=_each)
     """Robots by name; `each` holds for all of them."""
-    landmarks: Landmark | None = None
-    """Landmark type; what fits each sensor if absent."""
-    association: Association = section_of("association", "identity")()
-    """Data association: the landmark of each observation."""
-    upkeep: Upkeep = section_of("upkeep", "upkeep")()
-    """Confirmation of landmarks from observations without an id."""
-    estimator: Estimator = section_of("estimator", "invariant")()
-    """Filter."""
+
+
+OF_FILTER: Any = options_section(
+    [SETTINGS[name] for name in ("landmarks", "association", "upkeep", "estimator", "longest_pause_s")], _Head,
+    association="identity", upkeep="upkeep", estimator="invariant",
+)  # fmt: skip
+
+
+class Config(OF_FILTER):  # type: ignore[misc]
+    """Everything that decides a run.  A saved run's config.yaml is one of these and can be run again.
+
+    >>> config = load_config("native", ["association.type=auto"])
+    >>> isinstance(config, Config), list(config.robots), config.association.type
+    (True, ['each'], 'auto')
+    """
+
+    called: ClassVar[str] = "config"
+
     map: MapConfig = MapConfig()
     """Covariance storage."""
     picture: Picture | None = None
     """Content and view of map.png, the page, videos and `kalmark view`."""
-    longest_pause_s: Positive = LONGEST_PAUSE_S
-    """An event that comes later after the one before it has a wrong stamp and is refused; 10 such in a row are not."""
 
     _where: dict[KeyPath, str] = PrivateAttr(default_factory=dict)
 

@@ -6,6 +6,7 @@ The sections of models are made from their declarations.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -28,6 +29,7 @@ from kalmark.declare import (
     class_of,
     classes,
     classes_of,
+    has_one_model,
     is_own,
     load_plugin,
     missing_models,
@@ -44,9 +46,10 @@ from kalmark.plugins import entry_points_of, load
 from kalmark.slam.sources import SearchingDetector
 
 FAR = MOST["m"]
-Number = Annotated[float, Field(ge=-FAR, le=FAR, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, le=FAR, allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, le=FAR, allow_inf_nan=False)]
+USUAL = {
+    "landmark": "point", "association": "identity", "estimator": "invariant", "initialization": "immediate"
+}  # fmt: skip
+"""The type of a section that names none, by role."""
 
 
 class Section(BaseModel):
@@ -126,15 +129,14 @@ class ModelSection(Section):
 
 
 class Choice:
-    """The section of one model of a role, by its `type`; without `typed` there is one model, and no type.
+    """The section of one model of a role, by its `type`; where a role has one model, there is no type.
 
     With `sensor`, a class, it is that of a detector for it.
     """
 
-    def __init__(
-        self, role: str, world: str = "", default: str | None = None, *, typed: bool = True, sensor: Any = None
-    ) -> None:
-        self.role, self.world, self.default, self.typed, self.sensor = role, world, default, typed, sensor
+    def __init__(self, role: str, world: str = "", sensor: Any = None) -> None:
+        self.role, self.world, self.sensor = role, world, sensor
+        self.typed, self.default = not has_one_model(role), USUAL.get(role)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
         """Return how pydantic validates it: at the time, as a plugin may have added models since."""
@@ -251,8 +253,32 @@ def _in(model: type) -> str:
     return "the plane" if world_of_class(model) == "plane" else "space"
 
 
+def options_section(
+    declared: Iterable[Parameter],
+    base: type[Section] = Section,
+    kinds: Mapping[str, Any] | None = None,
+    **defaults: Any,
+) -> Any:
+    """Return a section of options as they are declared, in the place of some other `kinds` and `defaults`.
+
+    The default of a model is the name of its type.
+    """
+    fields: dict[str, Any] = {}
+    for each in declared:
+        default = defaults.get(each.name, each.default)
+        number: Any = Annotated[float, each.within]
+        kind = number if each.type is float else annotation(replace(each, optional=False))
+        kind = (kinds or {}).get(each.name, kind if default is not None else kind | None)
+        default = section_of(each.role, default)() if each.role and default is not None else default
+        fields[each.name] = kind, Field(default=default, description=each.text)
+    return create_model("Options", __base__=base, **fields)
+
+
 def annotation(parameter: Parameter) -> Any:
     """Return what pydantic validates a parameter by: its declaration."""
+    if parameter.role:
+        choice = Annotated[Any, Choice(parameter.role)]
+        return choice | None if parameter.optional else choice
     if parameter.values is not None:
         role = parameter.values.role
         kind = dict[str, Annotated[Any, Choice(role)] if role else str]  # type: ignore[misc, valid-type]

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from kalmark.errors import ModelError
 from kalmark.filter.compressed import restoring as compressed
 from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.compressed.restoring import NUMBERS
@@ -20,17 +19,10 @@ STEP = 3e6  # multiplications of a dense map that take as long as a compressed m
 ENTRY = 8e3  # of a block that becomes active, for each row of the map
 DENSE = int(math.sqrt(STEP / 20.0) / 2.0)  # points of the plane of which ten are observed: it never pays for fewer
 MOST = 1000  # landmarks of a dense map: 32 MB in the plane, and four times as much as soon as it grows
-MAPS = ("auto", "dense", "postponed")
 
 
 def new_map(type_: str, numbers: str) -> Map:
-    """Return an empty map of a type; `numbers` are those in which a compressed one keeps inactive blocks.
-
-    Raises ModelError for a type or numbers that there are not.
-    """
-    for what, value, known in (("map", type_, MAPS), ("numbers", numbers, NUMBERS)):
-        if value not in known:
-            raise ModelError(f"{what} is {value!r}, expected one of {', '.join(known)}")
+    """Return an empty map of a type; `numbers` are those in which a compressed one keeps inactive blocks."""
     return CompressedMap(Triangle(NUMBERS[numbers])) if type_ == "postponed" else StochasticMap()
 
 

@@ -7,10 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from kalmark.declare import Values, Within, declared_options, documented
 from kalmark.errors import LogError, PluginError, one_line
 from kalmark.events import Event, Fix, Scan, short_text, sort_key
 from kalmark.logs.download import find_data
@@ -20,10 +21,15 @@ from kalmark.logs.log_corrections import correct_log
 from kalmark.logs.native import NATIVE, stream
 from kalmark.logs.overflow import refuse_overflow
 from kalmark.logs.poses import KITTI, TUM, read_path
-from kalmark.logs.source import Format, Request, choice, one_of, quantity, raise_refusal
+from kalmark.logs.source import Format, Request, one_of, raise_refusal, refuse_options
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3
 from kalmark.plugins import load_all
 
+OnError = Literal["raise", "skip"]
+RobotNames = Sequence[str | int] | str | int | None
+Files = Path | str | Mapping[str, Path | str] | None
+Since = Annotated[float | None, Within(ge=0)]
+Sigma = Annotated[float | None, Within(ge=1e-9)]
 FORMATS: dict[str, Format] = {entry.name: entry for entry in (NATIVE, TUM, KITTI)}
 """The formats of the core, and those that a program of the user's adds; `known_formats` has those of plug-ins, too."""
 
@@ -44,36 +50,48 @@ def _of_plugins() -> tuple[dict[str, Format], dict[str, PluginError]]:
     return load_all("formats")
 
 
+@documented
 def open_log(
-    path: Path | str,
-    format: str | None = None,
+    path: Annotated[Path | str, "Folder or file; beside the configuration, in KALMARK_DATA or downloaded."],
+    format: Annotated[str | None, "Format of the log; recognised if absent."] = None,
     *,
-    robots: Sequence[str | int] | str | int | None = None,
-    from_s: float | None = None,
-    to_s: float | None = None,
-    on_error: Literal["raise", "skip"] = "raise",
-    ids: Literal["given", "hidden"] = "given",
-    truth: Path | str | Mapping[str, Path | str] | None = None,
-    fixes: Path | str | Mapping[str, Path | str] | None = None,
-    sigma_fixes_m: float | None = None,
-    sigma_fixes_z_m: float | None = None,
-    factors: Mapping[str, Any] | None = None,
-    shift_s: Mapping[str, Any] | None = None,
-    increments: Literal["recorded", "cut"] = "recorded",
+    robots: Annotated[RobotNames, "Use only these robots, by name or number."] = None,
+    from_s: Annotated[Since, "Start here, counted from the first event of the log."] = None,
+    to_s: Annotated[Since, "End here, counted from the first event of the log."] = None,
+    on_error: Annotated[OnError, "Action on bad input: refuse, or leave out."] = "raise",
+    ids: Annotated[
+        Literal["given", "hidden"],
+        "`hidden`: the filter gets no ids of landmarks; the summary has its rate of wrong associations.",
+    ] = "given",
+    truth: Annotated[
+        Files,
+        "A file of true poses in the format of TUM or KITTI, to score against; by robot if there are several.",
+    ] = None,
+    fixes: Annotated[Files, "The same, of positions that the filter is given, as fixes."] = None,
+    sigma_fixes_m: Annotated[Sigma, "Noise of each coordinate of `fixes`."] = None,
+    sigma_fixes_z_m: Annotated[Sigma, "Noise of their heights; `sigma_fixes_m` if absent."] = None,
+    factors: Annotated[
+        Mapping[str, Any] | None,
+        Values(),
+        "Factors of columns, also of one robot or sensor: `{w_radps: -1, laser: {range_m: .001}}`; "
+        "`t_s`: of all times.",
+    ] = None,
+    shift_s: Annotated[
+        Mapping[str, Any] | None,
+        Values(),
+        "Added to the times of the scans of a sensor, by its name; of one robot: `{rover: {laser: .1}}`.",
+    ] = None,
+    increments: Annotated[
+        Literal["recorded", "cut"],
+        "`cut`: a scan between the ends of two increments cuts the second, and finds its robot where it was then.",
+    ] = "recorded",
     progress: bool = False,
     **options: Any,
 ) -> Log:
     """Read the log at `path`, a folder or file of any known format.
 
-    `robots` keeps some robots (names, or MRCLAM's numbers), `from_s` and `to_s` the events between these seconds
-    from the log's first event.  With `on_error="skip"` bad rows are left out and listed in `log.skipped`.  With
-    `ids="hidden"` the scans have no ids of landmarks; `log.true_ids` has them.
-    `truth` and `fixes` are files of poses in the formats of TUM or KITTI, by robot if there are several: true poses to
-    score against, and positions for the filter with the noise `sigma_fixes_m`,
-    and `sigma_fixes_z_m` of their heights.
-    `factors` of columns and `shift_s` of sensors correct units, signs and stamps (`kalmark.logs.log_corrections`).
-    With `increments="cut"`, as in a configuration, a scan between the ends of two increments cuts the second.
-    With `progress` tables that take longer than two seconds show a bar on standard error.
+    Bad rows that are left out are listed in `log.skipped`, ids that are hidden in `log.true_ids`.  In a configuration
+    `increments` is "cut".  With `progress` tables that take longer than two seconds show a bar on standard error.
     `options` are the format's own (docs/datasets.md).  A relative path is looked for by `find_data`.
     Raises LogError, with ``file:line:`` for a bad row.
 
@@ -83,25 +101,31 @@ def open_log(
     >>> km.open_log("my_log", to_s=2.0)
     <Log 'my_log' of 'robot': 42 events in 2.0 s, with truth>
     """
+    chosen: dict[str, Any] = {
+        "from_s": from_s, "to_s": to_s, "on_error": on_error, "ids": ids, "factors": factors, "shift_s": shift_s,
+        "truth": truth, "fixes": fixes, "sigma_fixes_m": sigma_fixes_m, "sigma_fixes_z_m": sigma_fixes_z_m,
+        "increments": increments,
+    }  # fmt: skip
     entry, found = recognise(find_data(path), format)
-    entry.refuse_options(options)
+    refuse_options(OPTIONS, chosen)
+    refuse_options(entry.options, options, entry.name)
     request = request_of(robot_names(robots, entry.robot_prefix), on_error, progress)
     log = correct_log(entry.read(found, request, **options), factors, shift_s)
     refuse_overflow(log)
     log = with_poses(log, request, truth, fixes, sigma_fixes_m, sigma_fixes_z_m)
     log = select_events(log, request, from_s, to_s, ids)
-    chosen = {
-        "from_s": from_s, "to_s": to_s, "on_error": on_error, "ids": ids, "factors": factors, "shift_s": shift_s,
-        "truth": _names(log, "truth", truth), "fixes": _names(log, "fixes", fixes), "sigma_fixes_m": sigma_fixes_m,
-        "sigma_fixes_z_m": sigma_fixes_z_m, "increments": increments, **options,
-    }  # fmt: skip
+    chosen |= {name: _names(log, name, chosen[name]) for name in ("truth", "fixes")} | options
     log = replace(log, options={name: value for name, value in chosen.items() if value is not None})
-    return cut_increments(log) if choice(increments, "increments", ("recorded", "cut")) == "cut" else log
+    return cut_increments(log) if increments == "cut" else log
+
+
+OPTIONS = {option.name: option for option in declared_options(open_log)}
+"""The options of logs of any format."""
 
 
 def stream_log(
-    path: Path | str, *, robots: Sequence[str | int] | str | int | None = None,
-    on_error: Literal["raise", "skip"] = "raise", progress: bool = False,
+    path: Path | str, *, robots: RobotNames = None,
+    on_error: OnError = "raise", progress: bool = False,
 ) -> Iterator[Event]:  # fmt: skip
     """Yield the events of a native log one by one, in the order of `open_log`, in memory that does not grow with it.
 
@@ -121,19 +145,17 @@ def stream_log(
 
 def request_of(robots: Names | None, on_error: str, progress: bool = False) -> Request:
     """Return the request of the caller.  Raises LogError."""
+    refuse_options(OPTIONS, {"on_error": on_error})
     skipped: list[str] = []
-    refuse = (
-        raise_refusal
-        if choice(on_error, "on_error", ("raise", "skip")) == "raise"
-        else lambda line: skipped.append(one_line(line))
-    )
+    refuse = raise_refusal if on_error == "raise" else lambda line: skipped.append(one_line(line))
     return Request(robots, refuse, skipped, progress)
 
 
 def select_events(log: Log, request: Request, from_s: float | None, to_s: float | None, ids: str) -> Log:
     """Return the robots, the time and the ids of a log that were asked for.  Raises LogError."""
+    refuse_options(OPTIONS, {"from_s": from_s, "to_s": to_s, "ids": ids})
     log = clip_time(keep_robots(log, request), from_s, to_s)
-    return hide_ids(log) if choice(ids, "ids", ("given", "hidden")) == "hidden" else log
+    return hide_ids(log) if ids == "hidden" else log
 
 
 def with_poses(
@@ -149,8 +171,7 @@ def with_poses(
             f"log option fixes is {short_text(fixes)} and sigma_fixes_m is {short_text(sigma_m)}, expected both: a "
             "file of positions and their noise"
         )
-    given = ((sigma_m, "sigma_fixes_m"), (sigma_z_m, "sigma_fixes_z_m"))
-    sigmas = [quantity(sigma, name, 1e-9) for sigma, name in given if sigma is not None]
+    sigmas = [sigma for sigma in (sigma_m, sigma_z_m) if sigma is not None]
     events: list[Fix] = []
     for robot, path in places.items():
         d = 3 if any("z" in column for column in log.control_columns.get(robot, ("z",))) else 2
@@ -265,8 +286,8 @@ def clip_time(log: Log, from_s: float | None, to_s: float | None) -> Log:
     if from_s is None and to_s is None:
         return log
     start = log.events[0].t_ns
-    low = start if from_s is None else start + round(quantity(from_s, "from_s", 0.0) * 1e9)
-    high = log.events[-1].t_ns if to_s is None else start + round(quantity(to_s, "to_s", 0.0) * 1e9)
+    low = start if from_s is None else start + round(from_s * 1e9)
+    high = log.events[-1].t_ns if to_s is None else start + round(to_s * 1e9)
     events = [event for event in log if low <= event.t_ns <= high]
     if not events:
         length = (log.events[-1].t_ns - start) * 1e-9

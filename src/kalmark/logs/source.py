@@ -16,7 +16,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from kalmark.arrays import Array
-from kalmark.declare import Parameter, options_of
+from kalmark.declare import Parameter, parameters
 from kalmark.errors import LogError
 from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, short_text, sort_key
 from kalmark.files import refuse_aliases
@@ -98,20 +98,19 @@ class Format:
     @cached_property
     def options(self) -> dict[str, Parameter]:
         """The options that its logs may be read with, by name."""
-        return {option.name: option for option in options_of(self.read, 2)}
+        return {option.name: option for option in parameters(self.read)[2:]}
 
-    def refuse_options(self, given: Mapping[str, Any]) -> None:
-        """Refuse options that it does not have, and values that are not as declared.  Raises LogError."""
-        for name, value in given.items():
-            if name not in self.options:
-                wanted = f"{', '.join(self.options) or 'none'}{spelling_hint(name, self.options)}"
-                raise LogError(f"log option {name!r} is unknown to {self.name}, expected {wanted}")
-            option = self.options[name]
-            if value is not option.default and (wanted := option.refused(value)):
-                raise LogError(
-                    f"log option {name} is {short_text(value)}, "
-                    f"expected {wanted}{spelling_hint(str(value), option.words)}"
-                )
+
+def refuse_options(declared: Mapping[str, Parameter], given: Mapping[str, Any], format: str = "") -> None:
+    """Refuse options of logs that are unknown to a format, or not as they are declared.  Raises LogError."""
+    for name, value in given.items():
+        if name not in declared:
+            wanted = f"{', '.join(declared) or 'none'}{spelling_hint(name, declared)}"
+            raise LogError(f"log option {name!r} is unknown to {format}, expected {wanted}")
+        option = declared[name]
+        if value is not option.default and (wanted := option.refused(value)):
+            hint = spelling_hint(str(value), option.words)
+            raise LogError(f"log option {name} is {short_text(value)}, expected {wanted}{hint}")
 
 
 def one_robot(
@@ -164,22 +163,14 @@ def one_of(words: Iterable[str], word: Any) -> str:
     return f"expected one of {', '.join(words)}{spelling_hint(str(word), words)}"
 
 
-def choice(value: Any, name: str, allowed: Names) -> str:
-    """Return an option's value if it is one of those allowed.  Raises LogError."""
-    if value not in allowed:
-        raise LogError(f"log option {name} is {value!r}, {one_of(allowed, value)}")
-    return str(value)
-
-
-def quantity(value: Any, name: str, low: float = float("-inf")) -> float:
-    """Return an option's value as a finite number of at least `low`.  Raises LogError."""
+def quantity(value: Any, name: str) -> float:
+    """Return an option's value as a finite number.  Raises LogError."""
     try:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = float("nan")
-    if isinstance(value, bool) or not low <= number < float("inf"):
-        wanted = "a finite number" if low == float("-inf") else f"a finite number of at least {low:g}"
-        raise LogError(f"log option {name} is {short_text(value)}, expected {wanted}")
+    if isinstance(value, bool) or not math.isfinite(number):
+        raise LogError(f"log option {name} is {short_text(value)}, expected a finite number")
     if abs(number) > MOST["m"]:
         raise LogError(f"log option {name} is {short_text(value)}, expected at most {MOST['m']:.0e}")
     return number

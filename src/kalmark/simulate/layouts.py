@@ -18,14 +18,14 @@ from numpy.random import Generator
 from pydantic import AfterValidator, Field, model_validator
 
 from kalmark.arrays import Array, Index
-from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section, unexpected_value
+from kalmark.config.sections import OneOf, Section, unexpected_value
+from kalmark.declare import Count, NotNegative, Number, Positive, Within
 from kalmark.events import Raw
 from kalmark.geometry.frames3d import from_euler_pose
 
 TOUCH_M = 1e-3  # walls this near to each other meet
 STRAIGHT = 0.05  # sine of an angle between walls, below which they make no corner
 
-Count = Annotated[int, Field(ge=1)]
 Segment = Annotated[tuple[Number, Number, Number, Number, Number, Number], Field(strict=False)]
 Wall = Annotated[tuple[Number, Number, Number, Number], Field(strict=False)]
 Triple = Annotated[tuple[Number, Number, Number], Field(strict=False)]
@@ -109,7 +109,7 @@ class WallLayout(OfPoints):
     """Southern wall."""
     y_max_m: Number = 4.0
     """Northern wall."""
-    n: Annotated[int, Field(ge=4)] = 9
+    n: Annotated[int, Within(ge=4)] = 9
     """Rows and columns; 7 gives 36 landmarks."""
 
     @model_validator(mode="after")

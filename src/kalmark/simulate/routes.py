@@ -16,7 +16,8 @@ from pydantic import Field, model_validator
 
 from kalmark.arrays import Array
 from kalmark.compiled import address_of, by_address, compiled, python_form, signature_of
-from kalmark.config.sections import NotNegative, Number, OneOf, Positive, Section
+from kalmark.config.sections import OneOf, Section
+from kalmark.declare import NotNegative, Number, Positive
 from kalmark.geometry.angles import rotation, wrap
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import left_jacobian, matrix

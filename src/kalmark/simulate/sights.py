@@ -18,7 +18,8 @@ from pydantic import Field
 
 from kalmark import presets
 from kalmark.arrays import Array, Flags, Index
-from kalmark.config.sections import NotNegative, Section
+from kalmark.config.sections import Section
+from kalmark.declare import Count, NotNegative, Positive, Within
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE3
@@ -29,7 +30,7 @@ from kalmark.models.tags import corners, tag_seen_from
 from kalmark.models.walls import orient_segments
 from kalmark.simulate.layouts import Scenery
 
-Share = Annotated[float, Field(ge=0, le=1)]
+Share = Annotated[float, Within(ge=0, le=1)]
 Pair = Annotated[tuple[int, int], Field(strict=False)]
 
 POINTS, SEGMENTS, TAGS = "points", "segments", "tags"
@@ -68,13 +69,13 @@ class Sighted(NamedTuple):
 class SimulatedSensing(Section):
     """Deviations of a simulated sensor from its model: a slower rate, and faults."""
 
-    every: Annotated[int, Field(ge=1)] | None = None
+    every: Count | None = None
     """A scan at every so manieth step: at every one, or that of the sensor's `preset`."""
-    first: Annotated[int, Field(ge=1)] | None = None
+    first: Count | None = None
     """The first step with a scan; if absent the one of `every`."""
-    beams: Annotated[int, Field(ge=3)] = 541
+    beams: Annotated[int, Within(ge=3)] = 541
     """Beams of a scan, where the sensor has the detector of a laser: then its scans are raw."""
-    beams_fov_deg: Annotated[float, Field(gt=0, le=360)] = 270.0
+    beams_fov_deg: Annotated[float, Within(gt=0, le=360)] = 270.0
     """Angle between the first and the last of them."""
     images: bool = False
     """A camera in a world of textures: give its images instead of measurements."""
@@ -88,7 +89,7 @@ class SimulatedSensing(Section):
     """Probability that a visible landmark is not reported: 0, or that of the sensor's `preset`."""
     outliers: Share = 0.0
     """Probability that a measurement is false: of a place drawn from its field of view."""
-    loop_reach_m: Annotated[float, Field(gt=0)] | None = None
+    loop_reach_m: Positive | None = None
     """An `odometer` that keeps poses: read a scan against an earlier one, too, if the robot is so near to it again."""
     swapped: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
     """Pairs of ids that are taken for each other."""
@@ -96,7 +97,7 @@ class SimulatedSensing(Section):
     """Ids that are never reported."""
     late_s: NotNegative = 0.0
     """By so much the stamps of its scans are later than the lag of the sensor makes them."""
-    faults_from_step: Annotated[int, Field(ge=1)] = 1
+    faults_from_step: Count = 1
     """All is well before this step."""
 
     def of(self, section: Any, dt_s: float) -> SimulatedSensing:

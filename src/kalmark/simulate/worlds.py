@@ -25,15 +25,14 @@ from kalmark.config.schema import (
     StartConfig,
     robot_world,
 )  # fmt: skip
-from kalmark.config.sections import Positive, Section, model_of, unexpected_value
+from kalmark.config.sections import Section, model_of, unexpected_value
 from kalmark.config.tree import Tree, merge_trees, read_tree
+from kalmark.declare import Count, Positive
 from kalmark.plugins import entry_points_of
 from kalmark.simulate.layouts import Layout
 from kalmark.simulate.routes import Constant, Route, Waypoints
 from kalmark.simulate.sights import SimulatedSensing
 from kalmark.slam.description import plain_value
-
-Count = Annotated[int, Field(ge=1)]
 
 
 class _Underway(Section):

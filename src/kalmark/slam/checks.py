@@ -9,10 +9,9 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import EventError, KalmarkError, ModelError
-from kalmark.events import MOST, Control, Fix, Scan, finite, is_number, label_of_event, refuse_huge, short_text
+from kalmark.events import MOST, Control, Fix, Scan, finite, label_of_event, refuse_huge, short_text
 from kalmark.filter import kernels
-from kalmark.management.upkeep import Upkeep
-from kalmark.models.protocols import Landmark, Motion, OwnNoise, Sensor, coasts, innovation_size
+from kalmark.models.protocols import Motion, OwnNoise, Sensor, coasts, innovation_size
 from kalmark.tracks.classes import Classes
 
 MOST_OBSERVATIONS = 5000  # of one scan: a map of as many takes 2 GB, and a scan of all of them half a minute
@@ -50,24 +49,6 @@ def refuse_odd_association(value: Any, what: str) -> None:
     """Refuse what does not decide which landmark was seen."""
     expected = "an object like km.association.Automatic(), with threshold and associate"
     require_methods(value, ("threshold", "associate"), what, expected)
-
-
-def refuse_odd_parts(
-    association: Any, estimator: Any, landmarks: Any, upkeep: Any, reparametrize: Any, longest_pause_s: Any
-) -> None:
-    """Refuse what a Slam cannot be made of."""
-    refuse_odd_association(association, "association")
-    like = "an object like km.estimators.Ekf(), with predict, correct, for_fixes and pose_jacobian"
-    require_methods(estimator, ("predict", "correct", "for_fixes", "pose_jacobian"), "estimator", like)
-    if landmarks is not None:
-        instance(landmarks, Landmark, "landmarks", "a landmark model")
-    instance(upkeep, Upkeep, "upkeep", "an Upkeep")
-    if reparametrize is not None and not (isinstance(reparametrize, int | float) and reparametrize >= 0):
-        raise ModelError(
-            f"reparametrize is {short_text(reparametrize)}, expected a number of at least 0, or None: never"
-        )
-    if not is_number(longest_pause_s) or not longest_pause_s > 0:
-        raise ModelError(f"longest_pause_s is {short_text(longest_pause_s)}, expected a number of seconds above 0")
 
 
 def _refuse_indefinite(covs: Array, what: str, definite: bool, error: type[KalmarkError] = EventError) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.declare import own_name, parameters, registered_name
+from kalmark.declare import declared_options, has_one_model, own_name, parameters, registered_name
 from kalmark.geometry.named_poses import describe_pose, pose_of, world_of
 from kalmark.models.landmark_views import Raised
 from kalmark.models.protocols import state_columns
@@ -39,14 +39,12 @@ SIGMAS = {
 }
 """The keys of the sigmas of a pose and their axes."""
 EXACT = ("quaternion", "state", "cov")
-UNTYPED = ("attention", "upkeep", "classes")  # roles of one model: their sections have no `type`
-OF_PLACE = ("name", "motion", "start", "sensors", "sensor", "at", "cov")  # fields that are more than one key
 _AXIS = re.compile(r"(?:_|(?<=[vwa]))[xyz](?=_)")  # of a key: vx_mps, gravity_x_mps2
 
 
 def describe(slam: Estimate) -> Description:
     """Return a Slam as a configuration has it: robots, landmarks, association, upkeep, estimator, map."""
-    out = {name: _described(value) for name, value in vars(slam.state.settings).items()}
+    out = _own_options(slam.state.settings)
     linear = out.pop("reparametrize")
     kept = {"type": out.pop("map"), "numbers": out.pop("numbers"), "reparametrize": "off" if linear is None else linear}
     return {"robots": {name: _robot(robot) for name, robot in slam.robots.items()}, **out, "map": kept}
@@ -67,7 +65,7 @@ def describe_model(value: Any) -> Description:
     """Return the type and the parameters of a model; a class without a name in configurations is file.py:Class."""
     name = registered_name(type(value)) or own_name(type(value))
     given = {own.name: plain_value(vars(value)[own.name]) for own in parameters(type(value))}
-    return given if name in UNTYPED else {"type": name} | given
+    return given if has_one_model(name) else {"type": name} | given
 
 
 def _described(value: Any) -> Any:
@@ -76,19 +74,22 @@ def _described(value: Any) -> Any:
     )
 
 
+def _own_options(owner: Any) -> Description:
+    return {each.name: _described(vars(owner)[each.name]) for each in declared_options(type(owner))}
+
+
 def _robot(robot: Robot) -> Description:
     world = robot.motion.space.world
     start = describe_place(robot.start, world, robot.cov, state_columns(robot.motion))
-    own = {name: _described(value) for name, value in vars(robot).items() if name not in OF_PLACE}
     sensors = {name: _mount(mount, world) for name, mount in robot.sensors.items()}
-    return {"motion": describe_model(robot.motion), "start": start, **own, "sensors": sensors}
+    return {**_own_options(robot), "start": start, "sensors": sensors}
 
 
 def _mount(mount: Mount, world: str) -> Description:
     out, place = describe_model(mount.sensor), describe_place(mount.at, world, mount.cov)
     if isinstance(mount.sensor, Raised):
         place["z_m"] = out.pop("height_m")
-    own = {name: _described(value) for name, value in vars(mount).items() if name not in OF_PLACE}
+    own = _own_options(mount)
     own["initialization"] = own["initialization"] or {"type": "immediate"}
     return out | {"mount": place} | own
 

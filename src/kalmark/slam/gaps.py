@@ -20,7 +20,6 @@ from kalmark.events import Control, seconds_text
 from kalmark.models.protocols import Motion
 from kalmark.report import Gap
 
-ACTIONS = ("refuse", "widen", "ignore")
 TIMES = 5
 RECENT = 1000  # intervals from which the usual one is found,
 RANK = 5  # of which the longest four may be gaps

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.association.protocol import Association
-from kalmark.declare import parameters
+from kalmark.declare import Role, Within, check_parameters, documented, parameters
 from kalmark.errors import ModelError
-from kalmark.events import MOST, ROUNDED, Scan, finite, is_number, is_writable, short_text, unit_quaternion
+from kalmark.events import MOST, ROUNDED, Scan, finite, is_writable, short_text, unit_quaternion
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
@@ -32,9 +32,8 @@ from kalmark.models.protocols import (
     refuse_other_views,
 )
 from kalmark.slam.checks import check_covariance, instance, refuse_odd_association, require_methods
-from kalmark.slam.gaps import ACTIONS, Gaps
+from kalmark.slam.gaps import Gaps
 from kalmark.slam.sources import SearchingDetector
-from kalmark.tracks.channel import ROBUST
 from kalmark.tracks.classes import Classes
 
 INFINITE = math.inf
@@ -62,18 +61,14 @@ def _pose(value: Any, what: str, sizes: tuple[int, ...]) -> Array:
     return pose
 
 
+@documented
 @dataclass(frozen=True, eq=False)
 class Mount:
     """A sensor and where it sits in the robot's frame: `at` = (x, y, heading), m and rad, or (x, y, z, qx, qy, qz, qw).
 
-    `landmark` is the type of landmark this sensor starts and `association` its own, if not the slam's.  `detector`
-    turns its raw scans into scans of landmarks.  `attention` is the budget for each of its scans, `upkeep` what makes
-    and removes a landmark, if not the slam's.  `initialization` starts landmarks late (None: at first sight; ranges:
-    by trilateration).  With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map,
-    called "robot.sensor", that calibrates itself.  So are scale and bias of a range, if they have sigmas, and `lag_s`,
-    the time by which the stamps of its scans are late, if that has (docs/race_track.md).  `robust` makes outliers count
-    less, "huber" or "student" (docs/association.md; None: all count in full).  `classes` are those that the sensor
-    reports of landmarks.
+    With `cov`, (3, 3) or (6, 6) in the robot's frame, the mount is uncertain: a block of the map, "robot.sensor", that
+    calibrates itself.  So are scale and bias of a range, if they have sigmas, and the lag (docs/race_track.md).  A
+    `detector` turns raw scans into scans of landmarks.
 
     >>> km.Mount(km.sensors.RangeBearing(sigma_range_m=0.1), at=(0.3, 0.0, 0.0)).at
     array([0.3, 0. , 0. ])
@@ -81,17 +76,47 @@ class Mount:
 
     sensor: Sensor
     at: Any = (0.0, 0.0, 0.0)
-    landmark: Landmark | None = None
-    association: Association | None = None
-    detector: Callable[[Scan], Scan] | None = None
-    attention: Attention = EVERYTHING
+    landmark: Annotated[
+        Landmark | None,
+        Role("landmark"),
+        "Landmark type of this sensor; `landmarks` if absent.  "
+        "A camera with a calibrated mount requires anchored ones.",
+    ] = None
+    association: Annotated[
+        Association | None,
+        Role("association"),
+        "Association of this sensor; the configuration's `association` if absent.",
+    ] = None
+    detector: Annotated[
+        Callable[[Scan], Scan] | None,
+        Role("detector"),
+        "Detector of landmarks in raw scans: one that finds what the sensor measures.",
+    ] = None
+    attention: Annotated[
+        Attention, Role("attention"), "Selection of the landmarks of a scan; all if absent."
+    ] = EVERYTHING  # fmt: skip
     cov: Any = None
-    upkeep: Upkeep | None = None
-    initialization: Delayed | Trilateration | Hypotheses | None = None
-    robust: str | None = None
-    lag_s: float = 0.0
-    sigma_lag_s: float = 0.0
-    classes: Classes | None = None
+    upkeep: Annotated[
+        Upkeep | None, Role("upkeep"), "Confirmation of landmarks; the configuration's `upkeep` if absent."
+    ] = None  # fmt: skip
+    initialization: Annotated[
+        Delayed | Trilateration | Hypotheses | None,
+        Role("initialization"),
+        "Start landmarks at first sight, or late; late ones are points.",
+    ] = None
+    robust: Annotated[
+        Literal["huber", "student"] | None,
+        "Robust weight of outliers: bounded, or nearly zero.  All observations count in full if absent.",
+    ] = None
+    lag_s: Annotated[
+        float, Within(ge=-MOST_LAG_S, le=MOST_LAG_S), "Time by which the stamps of its scans are late."
+    ] = 0.0
+    sigma_lag_s: Annotated[
+        float, Within(ge=0, le=MOST_LAG_S), "Standard deviation of the lag; above 0 it is in the map and is estimated."
+    ] = 0.0
+    classes: Annotated[
+        Classes | None, Role("classes"), "Classes that the sensor reports of landmarks, as colours; none if absent."
+    ] = None
 
     def __post_init__(self) -> None:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
@@ -119,29 +144,15 @@ class Mount:
             instance(self.initialization, one_of, "Mount: initialization", ways)
         if self.classes is not None:
             instance(self.classes, Classes, "Mount: classes", "a Classes")
-            if isinstance(self.sensor, OfState):
-                name = type(self.sensor).__name__
-                raise ModelError(f"Mount: classes are given, but a {name} measures its robot, expected None")
-        if self.robust is not None:
-            what = f"Mount: robust is {short_text(self.robust)}"
-            if self.robust not in ROBUST:
-                raise ModelError(f"{what}, expected {' or '.join(ROBUST)}, or None")
-            if isinstance(self.sensor, OfState):
-                raise ModelError(f"{what}, but a {type(self.sensor).__name__} measures its robot, expected None")
-        self._refuse_odd_lag()
-        object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
-
-    def _refuse_odd_lag(self) -> None:
-        for key, least in (("lag_s", -MOST_LAG_S), ("sigma_lag_s", 0.0)):
-            if not (is_number(vars(self)[key]) and least <= vars(self)[key] <= MOST_LAG_S):
-                raise ModelError(
-                    f"Mount: {key} is {short_text(vars(self)[key])}, expected seconds, at most {MOST_LAG_S:g}"
-                )
+        check_parameters(self, "Mount: ")
+        of_robot = f"but a {type(self.sensor).__name__} measures its robot, expected"
+        if self.robust is not None and isinstance(self.sensor, OfState):
+            raise ModelError(f"Mount: robust is {short_text(self.robust)}, {of_robot} None")
+        if self.classes is not None and isinstance(self.sensor, OfState):
+            raise ModelError(f"Mount: classes are given, {of_robot} None")
         if self.lags and isinstance(self.sensor, OfState | SeesVelocity):
-            name = type(self.sensor).__name__
-            raise ModelError(
-                f"Mount: lag_s is {self.lag_s:g}, but a {name} measures its robot, expected 0 and no sigma"
-            )
+            raise ModelError(f"Mount: lag_s is {self.lag_s:g}, {of_robot} 0 and no sigma")
+        object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
 
     @property
     def lags(self) -> bool:
@@ -177,28 +188,35 @@ class Mount:
         return mount_space(pose, len(mean) - pose), mean, block_diag(*covs)
 
 
+@documented
 @dataclass(frozen=True, eq=False)
 class Robot:
     """A robot: its motion model, its start with covariance `cov` (None: known exactly), its sensors.
 
-    `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.  `gaps` is
-    the action on controls that stop: "widen" the covariance by what the robot may have moved meanwhile, at most by
-    these speeds (None: by the largest so far), "refuse" to go on, or "ignore" it.  Controls up to `rests_until_ns` do
-    not move it: those at rest, from which its start was found.
+    `start` is (x, y, heading) in the plane and (x, y, z, qx, qy, qz, qw) in space, by default the origin.
 
     >>> km.Robot("rover", km.motion.Unicycle(sigma_v_mps=0.1), start=(1.0, 2.0, 0.0)).name
     'rover'
     """
 
     name: str
-    motion: Motion
+    motion: Annotated[Motion, Role("motion"), "Motion model."]
     start: Any = None
     sensors: Mapping[str, Mount] = field(default_factory=dict)
     cov: Any = None
-    gaps: str = "widen"
-    max_speed_mps: float | None = None
-    max_turn_radps: float | None = None
-    rests_until_ns: int | None = None
+    gaps: Annotated[
+        Literal["refuse", "widen", "ignore"],
+        "Controls that stop: refuse the log, widen the covariance by what the robot may have moved, or ignore it.",
+    ] = "widen"
+    max_speed_mps: Annotated[
+        float | None, Within(gt=0), "Greatest speed in a gap; from the controls so far if absent."
+    ] = None  # fmt: skip
+    max_turn_radps: Annotated[
+        float | None, Within(gt=0), "Greatest turn rate in a gap; from the controls so far if absent."
+    ] = None  # fmt: skip
+    rests_until_ns: Annotated[
+        int | None, "Controls up to this time do not move the robot; by `start.at_rest` if absent."
+    ] = None  # fmt: skip
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
@@ -210,16 +228,7 @@ class Robot:
                     f"Robot: the name {short_text(name)} has control characters or surrogates, expected none"
                 )
         what = f"robot {self.name!r}"
-        if self.gaps not in ACTIONS:
-            raise ModelError(
-                f"{what}: gaps is {short_text(self.gaps)}, expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}"
-            )
-        for key in ("max_speed_mps", "max_turn_radps"):
-            limit = vars(self)[key]
-            if limit is not None and not (isinstance(limit, int | float) and 0 < limit < math.inf):
-                raise ModelError(f"{what}: {key} is {short_text(limit)}, expected a number > 0, or None")
-        if self.rests_until_ns is not None:
-            instance(self.rests_until_ns, int, f"{what}: rests_until_ns", "a whole number, or None")
+        check_parameters(self, f"{what}: ")
         instance(self.motion, Motion, f"{what}: motion", "a motion model")
         refuse_misspelt_names(self.motion, f"{what}: motion")
         k = len(self.motion.columns)

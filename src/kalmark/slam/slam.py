@@ -29,7 +29,6 @@ from kalmark.association.query import Query
 from kalmark.association.ratio import defer_doubtful_pairs
 from kalmark.errors import DivergedError, EventError, MapError, ModelError
 from kalmark.events import (
-    LONGEST_PAUSE_S,
     Control,
     Event,
     Fix,
@@ -46,7 +45,7 @@ from kalmark.filter.estimators import CompilingEstimator, Estimator, Invariant
 from kalmark.geometry.spaces import RHO
 from kalmark.management import reparametrize as points
 from kalmark.management.attention import reasons_against_start
-from kalmark.management.upkeep import CAREFUL, Upkeep
+from kalmark.management.upkeep import Upkeep
 from kalmark.models.protocols import Landmark
 from kalmark.report import Observation, Report, outcomes_of
 from kalmark.slam import by_ids, locating, maintenance, moves, starting, state_corrections, tentative
@@ -55,7 +54,6 @@ from kalmark.slam.checks import (
     instance,
     measurements,
     refuse_bad_control,
-    refuse_odd_parts,
     refuse_other_classes,
 )
 from kalmark.slam.checks import check_numbers as checked_numbers
@@ -73,7 +71,6 @@ from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track
 
 IN_A_ROW = 10  # events that are all far ahead of the map: then it was a pause
-LINEAR = 0.03  # the linearity index of [TB]; Civera, Davison and Montiel 2008
 
 
 class Slam(Estimate):
@@ -103,22 +100,21 @@ class Slam(Estimate):
         association: Association | None = None,
         estimator: Estimator | None = None,
         landmarks: Landmark | None = None,
-        map: str = "auto",
-        reparametrize: float | None = LINEAR,
-        numbers: str = "float64",
-        upkeep: Upkeep = CAREFUL,
-        longest_pause_s: float = LONGEST_PAUSE_S,
+        map: str = Settings.map,
+        reparametrize: float | None = Settings.reparametrize,
+        numbers: str = Settings.numbers,
+        upkeep: Upkeep = Settings.upkeep,
+        longest_pause_s: float = Settings.longest_pause_s,
     ) -> None:
         association = ByIdentity() if association is None else association
         estimator = Invariant() if estimator is None else estimator
-        refuse_odd_parts(association, estimator, landmarks, upkeep, reparametrize, longest_pause_s)
         by_name: dict[str, Robot] = {}
         for robot in robots_given(robots):
             if robot.name in by_name:
                 raise ModelError(f"robot {robot.name!r} is given twice, expected different names")
             by_name[robot.name] = robot
-        settings = Settings(association, estimator, landmarks, map, reparametrize, numbers, upkeep, longest_pause_s)
-        super().__init__(State(by_name, settings))
+        chosen: Any = map, reparametrize, numbers, upkeep, longest_pause_s  # checked by `Settings`
+        super().__init__(State(by_name, Settings(association, estimator, landmarks, *chosen)))
         self.before_scan: Callable[[str, str], object] | None = None  # called with robot and sensor, may call `expect`
         self._ahead: list[int] = []  # times of the events in a row that came too far ahead
         self._takes: dict[type, Any] = {Control: self._control, Scan: self._scan, Fix: self._fix}
@@ -479,14 +475,14 @@ class Slam(Estimate):
         robots, settings = without_detectors(self.robots.values()), self.state.settings
         kinds = ("dense", "postponed") if self.state.may_grow else (settings.map,)
         for kind in kinds:
-            twin = Slam(robots, **vars(replace(settings, map=kind)))
+            twin = Slam(robots, **vars(settings) | {"map": kind})
             surveyed = rehearse(twin, twin.process, twin.add_landmark)
             if any(policy.restarts for policy in self.state.policies.values()):  # and once with rays that stay
-                twin = Slam(robots, **vars(replace(settings, map=kind)))
+                twin = Slam(robots, **vars(settings) | {"map": kind})
                 twin.state.policies = {k: replace(of, restarts=False) for k, of in twin.state.policies.items()}
                 rehearse(twin, twin.process, twin.add_landmark)
         if self.tracks.known:
-            twin = Slam(robots, **vars(replace(settings, map=kinds[0])))
+            twin = Slam(robots, **vars(settings) | {"map": kinds[0]})
             for name, mean, model in surveyed:
                 twin.add_landmark(name, mean, None, model)
             rehearse(twin, twin.process, twin.add_landmark)

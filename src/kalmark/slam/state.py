@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.association import Association
+from kalmark.declare import Role, Within, check_parameters
 from kalmark.errors import DivergedError, MapError, ModelError
 from kalmark.events import Event, Id, label_of_event
 from kalmark.filter.estimators import Correction, Estimator, Initializing, Selective, Update
 from kalmark.filter.map import Map, StochasticMap
 from kalmark.filter.maps import MOST, CostBalance, compress_map, new_map
 from kalmark.geometry.spaces import SE2, SE3
-from kalmark.management.upkeep import Upkeep
+from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
-from kalmark.slam.checks import fault_of
+from kalmark.slam.checks import fault_of, instance, refuse_odd_association, require_methods
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
@@ -40,16 +42,41 @@ CURE = "start again from a pose that is less certain, or with larger sigmas of c
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Arguments of a `Slam` beside its robots, as its docstring has them."""
+    """Arguments of a `Slam` beside its robots.  Raises ModelError for one that is not as declared."""
 
-    association: Association
-    estimator: Estimator
-    landmarks: Landmark | None
-    map: str
-    reparametrize: float | None
-    numbers: str
-    upkeep: Upkeep
-    longest_pause_s: float
+    association: Annotated[Association, Role("association"), "Data association: the landmark of each observation."]
+    estimator: Annotated[Estimator, Role("estimator"), "Filter."]
+    landmarks: Annotated[Landmark | None, Role("landmark"), "Landmark type; what fits each sensor if absent."] = None
+    map: Annotated[
+        Literal["auto", "dense", "postponed"],
+        "`dense` corrects the whole covariance at once, `postponed` only what is in view, `auto` is dense while small.",
+    ] = "auto"
+    reparametrize: Annotated[
+        float | None,
+        Within(ge=0),
+        "Inverse-depth and anchored points become Euclidean below this linearity index; or off.",
+    ] = 0.03  # of [TB]; Civera, Davison and Montiel 2008
+    numbers: Annotated[
+        Literal["float64", "float32"],
+        "In what a postponed map keeps what is at rest; `float32` takes half the memory.",
+    ] = "float64"
+    upkeep: Annotated[
+        Upkeep, Role("upkeep"), "Confirmation of landmarks from observations without an id."
+    ] = CAREFUL  # fmt: skip
+    longest_pause_s: Annotated[
+        float,
+        Within(gt=0),
+        "An event that comes later after the one before it has a wrong stamp and is refused; 10 such in a row are not.",
+    ] = 12 * 3600.0
+
+    def __post_init__(self) -> None:
+        refuse_odd_association(self.association, "association")
+        like = "an object like km.estimators.Ekf(), with predict, correct, for_fixes and pose_jacobian"
+        require_methods(self.estimator, ("predict", "correct", "for_fixes", "pose_jacobian"), "estimator", like)
+        if self.landmarks is not None:
+            instance(self.landmarks, Landmark, "landmarks", "a landmark model")
+        instance(self.upkeep, Upkeep, "upkeep", "an Upkeep")
+        check_parameters(self, "")
 
 
 class State:

@@ -37,7 +37,7 @@ ALIKE = {
 }  # what else one model applies to
 EUCLIDEAN = ("point", "point3")
 TINY_RHO = 1e-9  # 1 / m: as good as infinitely far
-HUBER, STUDENT = ROBUST = ("huber", "student")
+HUBER, STUDENT = ("huber", "student")
 FULL, DEGREES = 0.95, 4.0  # of right observations count in full for Huber; degrees of freedom of Student's weights
 BY_KIND = {kind.kind: kind for kind in kinds.BUILT_IN}
 
@@ -87,7 +87,7 @@ class ObservationModel:
     def weighed(
         self, m: StochasticMap, robot: int, mount: int, slots: Index, y: Array, R: Array, how: str
     ) -> Array:  # fmt: skip
-        """Return the noise (K, p, p) with which outliers count less, `how` one of `ROBUST`."""
+        """Return the noise (K, p, p) with which outliers count less, `how`: "huber" or "student"."""
         run = form_for(self.model, corrections.robust_noise)
         k = DEGREES if how == STUDENT else huber_length(R.shape[1])
         scan = robot, mount, slots, self.d, y, np.ascontiguousarray(R), k
@@ -109,7 +109,7 @@ class Channel:
     `threshold` gives the gate on d2 from the size of an innovation.  `others` are the landmarks that sensors start.
     `motion` is that of its robot: a sensor that measures its velocity has it from the state; else it `counts`, from a
     clone of the robot's pose at its last scan.  `since` (1 + k,): the seconds since then, and the control in force
-    where that has the turn rate.  `robust`: how outliers count less, one of `ROBUST` (None: all count in full).
+    where that has the turn rate.  `robust`: how outliers count less, "huber" or "student" (None: all count in full).
     Of a sensor that `lags`, whose lag is in the map, `past` (7 or 14,) is that of its robot (`mount_ago_in_plane`).
     `classes` are those that the sensor reports of landmarks, None where it reports none.
     """

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from pydantic import Field
 
 from kalmark.arrays import Array
-from kalmark.config.sections import Positive
+from kalmark.declare import Positive, Within
 from kalmark.events import Frame
 from kalmark.geometry.frames3d import from_euler_pose, from_frame
 from kalmark.models.observe import sensor_pose
@@ -106,7 +106,7 @@ class TexturedRoom(_Textured):
     """From south to north."""
     height_m: Positive = 3.0
     """Of the walls."""
-    panels: Annotated[int, Field(ge=0)] = 8
+    panels: Annotated[int, Within(ge=0)] = 8
     """Upright panels of 0.4 to 1 m, turned at random, up to `panel_depth_m` before a random wall."""
     panel_depth_m: Positive = 1.0
     """The largest distance of a panel from its wall."""
