@@ -85,7 +85,7 @@ def _odd_filter(config: Config, landmarks: int) -> Iterator[str]:
         yield "has no known maps"
     slam = build_slam(config)
     (robot,), keys = slam.robots.values(), [*slam.state.channels]
-    if len(robot.sensors) != 1 or not keys:
+    if (len(robot.sensors), len(keys)) != (1, 1):
         yield "runs one sensor, of landmarks"
     channel, policy = slam.state.channels[keys[0]], slam.state.policies[keys[0]]
     late, model = (policy.deferred, policy.delayed, policy.detector), channel.models[channel.landmark.kind]

@@ -41,8 +41,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     if state.repeats((name, event.sensor), event.t_ns, event.y, event.ids):
         return record_repeated_reading(report, ids, channel.dof)
     scan = ScanContext(state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report)
-    if channel.noise_at is not None:
-        R = channel.noise(state.map, moving.slot, model, slots, R, scan.own_noise)
+    R = channel.noise(state.map, moving.slot, model, slots, R, event.cov is not None)
     update = Update(
         model.model, moving.slot, channel.mount, slots, model.d, event.y, R, channel.gate, not channel.finds_depth
     )
