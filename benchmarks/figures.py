@@ -439,7 +439,8 @@ def gaps() -> Iterator[Figure]:
     yield Figure(section, "pillars in rows: wrong maps that the verdict calls ok / right ones that it does not", "0 / 0",
                  command, row("total", "{2} / {3}"))  # fmt: skip
     section, command = "A robot that is elsewhere", "python benchmarks/carried.py"
-    for world, ids in itertools.product(("random_field", "sparse", "dense"), ("ids", "no ids")):
+    worlds = "random_field", "sparse", "dense", "no limits stated"
+    for world, ids in itertools.product(worlds, ("ids", "no ids")):
         yield Figure(section, f"carried away, `{world}`, {ids}: found / after, at most / false alarms / maps with something twice",
                      "95 % / 30 s / 0 / 0", command, row(f"{world} {ids}", "{1} of {3} / {9} s / {13} / {18}"))  # fmt: skip
     section, command = "Walls", "python benchmarks/walls.py"
