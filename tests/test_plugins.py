@@ -42,6 +42,10 @@ TRAM = Format("tram", "a file that ends in .tram", find, read)
 def last_stop(log: Path) -> None:
     """Print the time of the last event of a log."""
     print(km.open_log(log).events[-1].t_ns)
+
+
+def how_to_get(path: Path) -> str:
+    return "wait for the next tram" if path.suffix == ".tram" else ""
 '''
 KEY = '''"""Stop at which the tram waits."""
 
@@ -72,6 +76,10 @@ stop = stops
 
 [kalmark.names]
 Tram = trams:Tram
+logs.TRAM = trams:TRAM
+
+[kalmark.data]
+trams = trams:how_to_get
 """
 AGAIN = "; expected it installed: pip install --force-reinstall --no-deps kalmark"
 OUTSIDE = ("kalmark.bags", "kalmark.datasets", "kalmark.diagnosis", "kalmark.viewer", "kalmark.vision")
@@ -116,12 +124,15 @@ def trams(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_package_adds_a_format_with_its_options_a_model_a_verb_and_a_name(trams: Path) -> None:
+def test_a_package_adds_a_format_with_its_options_a_model_a_verb_and_names(
+    trams: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (trams / "day.yaml").write_text("log: {path: day.tram, step_s: 2}\nrobots: {each: {motion: {type: tram}}}\n")
     code = """
 import kalmark as km
 from kalmark.cli import main
 from kalmark.config import build_slam, open_run
+from kalmark.logs import TRAM
 
 config, log = open_run("day.yaml")
 robot = build_slam(config, log).robots["tram"]
@@ -136,7 +147,12 @@ try:
     km.open_log("day.tram", "broken")
 except km.KalmarkError as error:
     print(error)
+try:
+    km.open_log("night.tram")
+except km.KalmarkError as error:
+    print(TRAM.name, str(error).partition("; ")[2])
 """
+    monkeypatch.setenv("KALMARK_DATA", str(trams))
     done = python(code, trams)
     assert done.stdout.splitlines() == [
         "tram 4000000000 True",
@@ -144,6 +160,7 @@ except km.KalmarkError as error:
         "log option step_s is -1, expected a positive number",
         "log option 'steps' is unknown to tram, expected step_s; did you mean 'step_s'?",
         "log format is 'broken': 'broken' of trams:NOTHING cannot be loaded: module 'trams' has no attribute 'NOTHING'",
+        "tram wait for the next tram",
     ], done.stderr
 
 
@@ -181,9 +198,14 @@ def test_the_core_simulates_runs_saves_and_reloads_without_the_plug_ins(tmp_path
     assert "'diagnose' of kalmark.diagnosis.verdict:diagnose cannot be loaded" in warned[0]
 
 
-def test_what_needs_a_part_that_is_missing_names_it_in_one_line(tmp_path: Path) -> None:
+def test_what_needs_a_part_that_is_missing_names_it_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "camera.yaml").write_text(
         "robots: {r: {motion: {type: odometry_3d}, sensors: {eye: {type: pinhole, detector: {type: active_search}}}}}\n"
+    )
+    (tmp_path / "tags.yaml").write_text(
+        "robots: {r: {motion: {type: odometry_3d}, sensors: {eye: {type: tag_corners, detector: {type: tags}}}}}\n"
     )
     code = """
 import sys
@@ -198,22 +220,30 @@ for call in (
     lambda: km.open_log(".", "mrclam"),
     lambda: km.open_log("camera.yaml"),
     lambda: load_config("camera.yaml"),
+    lambda: load_config("tags.yaml"),
     lambda: km.diagnose,
+    lambda: km.detect.Tags,
+    lambda: km.open_log("dlr"),
 ):
     try:
         call()
     except (km.KalmarkError, AttributeError) as error:
         print(error)
 main(["convert", "log", "log.mcap"])
-print([main([verb, "x", "--option", "1"]) for verb in ("bag", "diagnose", "tune")])
+print([main([verb, "x", "--option", "1"]) for verb in ("bag", "data", "diagnose", "tune")])
 """
+    monkeypatch.delenv("KALMARK_DATA", raising=False)
     done = python(WITHOUT + code, tmp_path)
-    mrclam, unknown, detector, name, statuses = done.stdout.splitlines()
-    assert statuses == "[2, 2, 2]"
+    mrclam, unknown, detector, tags, name, tags_name, dlr, statuses = done.stdout.splitlines()
+    assert statuses == "[2, 2, 2, 2]"
     assert mrclam.startswith("log format is 'mrclam': 'mrclam' of kalmark.datasets.mrclam:MRCLAM cannot be loaded: ")
     assert f"'bag' of kalmark.bags.importer:BAG cannot be loaded: No module named 'kalmark.bags'{AGAIN}" in unknown
     assert "robots.r.sensors.eye.detector: got {'type': 'active_search'}, expected" in detector
     assert "'vision' of kalmark.vision cannot be loaded" in detector
+    assert "robots.r.sensors.eye.detector: got {'type': 'tags'}, expected" in tags
+    assert tags_name.startswith("'detect.Tags' of kalmark.vision.apriltags:Tags cannot be loaded")
+    assert dlr.startswith("log 'dlr' not found, expected it at ")
+    assert "downloads it" not in dlr
     assert name.startswith("'diagnose' of kalmark.diagnosis.verdict:diagnose cannot be loaded")
     assert "kalmark: 'mcap' of kalmark.bags.run_messages:export cannot be loaded" in done.stderr
     tune = "kalmark: 'tune' of kalmark.diagnosis.tune_verb:tune cannot be loaded: No module named 'kalmark.diagnosis'"

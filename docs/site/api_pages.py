@@ -91,7 +91,7 @@ def pages() -> dict[str, str]:
 def public_names(module: str) -> dict[str, Any]:
     """Return the names that a module lists, those of plug-ins included, without modules."""
     home = import_module(module)
-    names = [name for name in dir(home) if not name.startswith("_")] if home is km else home.__all__
+    names = [name for name in dir(home) if not name.startswith("_")] if "__dir__" in vars(home) else home.__all__
     things = {name: getattr(home, name) for name in names}
     return {name: thing for name, thing in things.items() if not inspect.ismodule(thing)}
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from kalmark.errors import KalmarkError, PluginError
-from kalmark.plugins import entry_points_of, load
+from kalmark.errors import KalmarkError
+from kalmark.plugins import name_of_plugin, names_with_plugins
 
 if TYPE_CHECKING:
     from kalmark import association, detect, geometry
@@ -79,22 +79,12 @@ def __getattr__(name: str) -> Any:
     """Import a name on its first use: the compiled models take a second that `kalmark --help` need not wait."""
     home = _MODULES.get(name) or next((module for module, names in _NAMES.items() if name in names), None)
     if home is None:
-        return _of_plugin(name)
-    module: Any = import_module(home)
-    globals()[name] = module if name in _MODULES else vars(module)[name]
-    return globals()[name]
-
-
-def _of_plugin(name: str) -> Any:
-    """Return what a plug-in adds under a name.  Raises AttributeError."""
-    if name not in entry_points_of("names"):
-        raise AttributeError(f"module 'kalmark' has no attribute {name!r}")
-    try:
-        globals()[name] = load("names", name)
-    except PluginError as error:
-        raise AttributeError(str(error)) from None
+        globals()[name] = name_of_plugin(__name__, name)
+    else:
+        module: Any = import_module(home)
+        globals()[name] = module if name in _MODULES else vars(module)[name]
     return globals()[name]
 
 
 def __dir__() -> list[str]:
-    return sorted({*__all__, *entry_points_of("names"), "__version__"})
+    return names_with_plugins(__name__, (*__all__, "__version__"))

@@ -6,16 +6,18 @@
 | `kalmark.models` | a module that registers models (`kalmark.register`) |
 | `kalmark.layouts` | a layout of simulated worlds, under its `type` |
 | `kalmark.keys` | a key of sensors: a module with `complete(tree)` and `with_events(config, log)` |
-| `kalmark.verbs` | a function of the command line |
+| `kalmark.verbs` | a function of the command line, or a `typer.Typer` of several |
 | `kalmark.writers` | what `kalmark convert` writes, under the ending of its file: `(path, log, run) -> {part: count}` |
 | `kalmark.viewers` | a viewer of runs: a module with `replay(run, save)` and `follow(slam, log, picture, save)` |
-| `kalmark.names` | a name of the package `kalmark` |
+| `kalmark.names` | a name of the package `kalmark`, or of its `logs` or `detect`, as `logs.fetch` |
+| `kalmark.data` | how a log that is not found can be had: `(path) -> text`, "" of another's |
 
 Nothing is imported before it is asked for, and one that cannot be loaded stops no other.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -63,3 +65,21 @@ def load_all(group: str) -> tuple[dict[str, Any], dict[str, PluginError]]:
         except PluginError as error:
             failed[name] = error
     return loaded, failed
+
+
+def name_of_plugin(module: str, name: str) -> Any:
+    """Return what a plug-in adds under a name to a module of kalmark.  Raises AttributeError."""
+    named = f"{module}.{name}".removeprefix("kalmark.")
+    if named not in entry_points_of("names"):
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    try:
+        return load("names", named)
+    except PluginError as error:
+        raise AttributeError(str(error)) from None
+
+
+def names_with_plugins(module: str, own: Iterable[str]) -> list[str]:
+    """Return the names of a module of kalmark, its own and those of plug-ins."""
+    within = f"{module}.".removeprefix("kalmark.")
+    added = (name.removeprefix(within) for name in entry_points_of("names") if name.startswith(within))
+    return sorted({*own, *(name for name in added if "." not in name)})

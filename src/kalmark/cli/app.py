@@ -16,7 +16,7 @@ from kalmark.cli.check import check
 from kalmark.cli.convert import convert
 from kalmark.cli.folders import compare, evaluate, explain, report, view
 from kalmark.cli.live import live
-from kalmark.cli.logs import config, data, simulate, worlds
+from kalmark.cli.logs import config, simulate, worlds
 from kalmark.cli.run import demo, run, warm_up
 from kalmark.cli.shared import say
 from kalmark.errors import KalmarkError, PluginError
@@ -64,10 +64,12 @@ for verb in (
     live,
 ):
     app.command()(verb)
-app.add_typer(data, name="data")
 verbs, missing = load_all("verbs")
-for name, function in verbs.items():
-    app.command(name)(function)
+for name, entry in verbs.items():
+    if isinstance(entry, typer.Typer):
+        app.add_typer(entry, name=name)
+    else:
+        app.command(name)(entry)
 for name, failure in missing.items():
     app.command(name, help=f"Missing: {failure}.", context_settings=ANY_ARGUMENTS)(_refused(failure))
 

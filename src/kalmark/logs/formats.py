@@ -14,12 +14,12 @@ import numpy as np
 from kalmark.declare import Values, Within, declared_options, documented
 from kalmark.errors import LogError, PluginError, one_line
 from kalmark.events import Event, Fix, Scan, short_text, sort_key
-from kalmark.logs.download import find_data
 from kalmark.logs.increments import cut_increments
 from kalmark.logs.log import Log, Names
 from kalmark.logs.log_corrections import correct_log
 from kalmark.logs.native import NATIVE, stream
 from kalmark.logs.overflow import refuse_overflow
+from kalmark.logs.places import find_data
 from kalmark.logs.poses import KITTI, TUM, read_path
 from kalmark.logs.source import Format, Request, one_of, raise_refusal, refuse_options
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3

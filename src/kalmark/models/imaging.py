@@ -16,6 +16,7 @@ from kalmark.models.landmark_views import Spatial, constant
 __all__ = ["Omnidirectional", "PinHole", "PixelDepth", "Segments", "Stereo", "TagCorners"]
 
 TELLING = 12.0  # least difference of the chi-squares of a tag's two poses for the first to be accepted
+BORDER = 0.2  # of an image, in which the middle ends
 FISHEYE = (400.0, -254.647909)  # 400 px at 90 degrees from the axis, in proportion to the angle
 FISHEYE_BACK = (
     254.647909, 0.0, -0.00130899694, 0.0, -1.34575854e-09, 0.0, -1.97650363e-15, 0.0, -3.04801702e-21, 0.0,
@@ -49,6 +50,10 @@ class _Camera(Spatial):
         """Return which of v (K, 3 or 4) appear in the image, borders included."""
         rays = np.ascontiguousarray(v[:, :3], dtype=np.float64)
         return cameras.is_in_view(self.code, rays, np.array(self.parameters), np.array(self.image, dtype=np.float64))
+
+    def why_unseen(self, v: Array) -> str:
+        """Return why what is at v (3 or 4,), out of view, does not appear in the image."""
+        return "it is behind the camera" if v[2] <= 0 else "it is outside the image"
 
     def invert(self, y: Array) -> tuple[Array, Array]:
         """Return the viewing rays (K, 3), unit vectors, of pixels y (K, 2), and their Jacobian (K, 3, 2)."""
@@ -301,6 +306,10 @@ class Segments(_PinHole):
         size = np.array(self.image, dtype=np.float64)
         a, b = np.ascontiguousarray(p1), np.ascontiguousarray(p2)
         return lines.visible_segment(T, a, b, self.intrinsics, size, self.min_length_px)
+
+    def sample_segments(self, rng: np.random.Generator, count: int) -> Array:
+        """Return segments (count, 4) in the middle of the image."""
+        return rng.uniform(BORDER, 1.0 - BORDER, (count, 4)) * [*self.image, *self.image]
 
     def start_noise(self, y: Array) -> Array:
         """Return the noise (K, 4, 4) of the pixels themselves, which starts a line."""

@@ -205,6 +205,10 @@ world_of = optional("world", "")
 """"plane" or "space", "" for a model of either."""
 image_size = optional("image", cast("tuple[float, float] | None", None))
 """The width and height of a sensor's image, px; None: it has none."""
+why_unseen = optional("why_unseen", cast("Callable[[Array], str] | None", None))
+"""Reason for which a sensor does not observe v (d,), in its frame and out of view; None: range and field of view."""
+sample_segments = optional("sample_segments", cast("Callable[[Any, int], Array] | None", None))
+"""Segments (K, m) as a sensor of segments may measure them, by a random generator and their number."""
 range_limit = optional("range_max_m", math.inf)
 """The distance of the farthest landmark that a sensor measures, m."""
 field_of_view = optional("fov_rad", 2 * math.pi)

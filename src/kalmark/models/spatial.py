@@ -56,6 +56,11 @@ class Wall(Spatial):
         """Return (K,) that all lines are in view: a line has no end."""
         return np.ones(len(v), dtype=np.bool_)
 
+    def sample_segments(self, rng: np.random.Generator, count: int) -> Array:
+        """Return segments (count, 4) of walls within the range of the sensor."""
+        distance = min(self.range_max_m, 10.0) / 4.0
+        return np.array([[distance, 0.4 * k, -distance, distance] for k in range(count)])
+
     def sees_segments(self, T: Array, p1: Array, p2: Array) -> tuple[Flags, Array]:
         """Return which segments from p1 to p2 (K, 2) are seen from T, and their measurements (K, 4)."""
         limits = self.range_min_m, self.range_max_m, self.fov_rad / 2

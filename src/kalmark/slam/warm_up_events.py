@@ -27,11 +27,8 @@ from kalmark.models.protocols import (
     OfState,
     Reparametrizable,
     SeesVelocity,
-    SegmentVisible,
-    image_size,
-    range_limit,
+    sample_segments,
 )
-from kalmark.models.sensors import Wall
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.merging import make_equal
 from kalmark.slam.robot import IDENTITY, Mount, Robot
@@ -44,7 +41,6 @@ INTERVAL = 5  # events in a compression interval
 REPEATS = 4  # scans of one landmark, while all others are inactive
 POINTS = ((VECTOR,), (VECTOR3,))
 MOVING = 0.5  # each number of a control
-LOST_PIXELS = 0.2  # of an image, at its border
 
 
 def without_detectors(robots: Iterable[Robot]) -> list[Robot]:
@@ -199,13 +195,8 @@ class _Scene:
         self.fixed: Array | None = None
         self.places: Array | None = None  # where the points are that stay, (SEEN, 2 or 3),
         self.points: Array | None = None  # and others that it observes
-        if isinstance(self.sensor, SegmentVisible) and (size := image_size(self.sensor)) is not None:
-            inside = rng.uniform(LOST_PIXELS, 1.0 - LOST_PIXELS, (SEEN, len(self.sensor.columns)))
-            self.fixed = inside * [*size, *size]
-            return
-        if isinstance(self.sensor, Wall):
-            distance = min(range_limit(self.sensor), 10.0) / 4.0
-            self.fixed = np.array([[distance, 0.4 * k, -distance, distance] for k in range(SEEN)])
+        if (segments := sample_segments(self.sensor)) is not None:
+            self.fixed = segments(rng, SEEN)
             return
         self.v = views(self.sensor, rng)[0][:SEEN].copy()
         d, numbers = 2 if len(T) == 3 else 3, self.v.shape[1]

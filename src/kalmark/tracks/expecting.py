@@ -147,7 +147,7 @@ def visible_landmarks(
         t = np.array([model.landmark.first_ends if end is None else end for end in extents])
         p, _ = model.landmark.endpoints(l, t)
         in_view, y = sensor.sees_segments(T, np.ascontiguousarray(p[:, 0]), np.ascontiguousarray(p[:, 1]))
-        return Looked(in_view, ["" if seen else "no part of its segment is in the image" for seen in in_view], y)
+        return Looked(in_view, ["" if seen else "no part of its segment is in view" for seen in in_view], y)
     v = landmarks_in_frame(model.landmark, T, l)
     in_view = sensor.sees(v) if isinstance(sensor, protocols.Visible) else np.ones(len(v), dtype=np.bool_)
     why = [""] * len(v)
@@ -165,9 +165,8 @@ def visible_landmarks(
 
 def _out_of_view(sensor: Any, v: Array) -> str:
     """Return why a sensor does not observe what is at v (d,) in its frame."""
-    image = protocols.image_size(sensor)
-    if image is not None:
-        return "it is behind the camera" if v[2] <= 0 else "it is outside the image"
+    if (why_unseen := protocols.why_unseen(sensor)) is not None:
+        return why_unseen(v)
     d = v[:2] if protocols.world_of(sensor) == "plane" else v[:3]
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = float(np.linalg.norm(d)) / (float(v[3]) if len(v) == 4 else 1.0)
@@ -222,7 +221,7 @@ def expect_at_pose(
         head = np.concatenate([head, channel.at])
     e = linearize(model.model, head, l, y)[0]
     if isinstance(model.landmark, protocols.Segmented):
-        e = y  # of a line, the part of its segment that is in the image
+        e = y  # of a line, the part of its segment that is in view
     _, z, E_h, E_l = linearize(model.model, head, l, np.ascontiguousarray(e))
     if channel.noise_at is None:
         R = channel.sensor.noise(e)

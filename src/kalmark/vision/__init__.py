@@ -1,8 +1,9 @@
 """Landmarks in images, searched where the filter expects them."""
 
+from kalmark.vision.apriltags import Tags
 from kalmark.vision.front_end import ActiveSearch
 from kalmark.vision.overlay import overlay
 from kalmark.vision.segments import LineSearch
 from kalmark.vision.straight import Straightened
 
-__all__ = ["ActiveSearch", "LineSearch", "Straightened", "overlay"]
+__all__ = ["ActiveSearch", "LineSearch", "Straightened", "Tags", "overlay"]

@@ -1,8 +1,7 @@
-"""Find datasets on disk, or fetch them from the public repository they come from, every file checked by its hash.
+"""Published logs: their list, and downloads from their public repositories, every file checked by its hash.
 
-`KALMARK_DATA` names a folder that already has datasets, `KALMARK_ORACLE` one of recordings, `KALMARK_CACHE` the
-download cache (default: the platform's), `KALMARK_DATA_URL` a mirror: a URL with any of {repo}, {commit}, {path} and
-{file}, or the URL of a folder laid out as `KALMARK_DATA` is.
+`KALMARK_DATA_URL` is a mirror: a URL with any of {repo}, {commit}, {path} and {file}, or the URL of a folder laid out
+as `KALMARK_DATA` is.
 """
 
 from __future__ import annotations
@@ -23,10 +22,9 @@ from textwrap import shorten
 from typing import NamedTuple
 from urllib.parse import quote, urlsplit
 
-import platformdirs
-
-from kalmark.errors import DataError, LogError
+from kalmark.errors import DataError
 from kalmark.files import hold_lock, refuse_bomb, unpack_file
+from kalmark.logs.places import cache_folder
 from kalmark.logs.source import spelling_hint
 
 ORIGIN = "https://raw.githubusercontent.com/{repo}/{commit}/{path}"
@@ -103,19 +101,10 @@ def list_data() -> tuple[Dataset, ...]:
     >>> [one.name for one in list_data()][:3]
     ['lost_in_the_woods', 'mrclam/MRCLAM_Dataset6', 'mrclam/MRCLAM_Dataset8']
     """
-    text = resources.files("kalmark.logs").joinpath("datasets.json").read_text(encoding="utf-8")
+    text = resources.files("kalmark.datasets").joinpath("datasets.json").read_text(encoding="utf-8")
     return tuple(
         Dataset(**{**entry, "files": tuple(DataFile(**file) for file in entry["files"])}) for entry in json.loads(text)
     )
-
-
-def cache_folder() -> Path:
-    """Return the download cache.
-
-    >>> (cache_folder() / "lost_in_the_woods").name
-    'lost_in_the_woods'
-    """
-    return Path(os.environ.get("KALMARK_CACHE") or platformdirs.user_cache_path("kalmark") / "data")
 
 
 def fetch(name: str, progress: Progress | None = None) -> Path:
@@ -281,31 +270,9 @@ def unpack(path: Path) -> None:
         raise DataError(f"{path.name}: cannot be unpacked ({error}), expected a complete archive") from None
 
 
-def find_data(path: Path | str, base: Path | str | None = None) -> Path:
-    """Return the path of a log; raise LogError if it does not exist.
-
-    A relative path is searched in `base` (default: the working folder), then in `KALMARK_DATA`, `KALMARK_ORACLE` and
-    the download cache.  It may begin with the name of these folders themselves, as oracle/NAME.json.gz does for a
-    `KALMARK_ORACLE` that ends in /oracle.
-
-    >>> log = km.log_from(controls={"t_s": [0.0], "robot": ["rover"], "v_mps": [0.5], "w_radps": [0.0]})
-    >>> folder = write_native(log, "my_log")
-    >>> find_data("my_log").name
-    'my_log'
-    """
-    path = Path(path)
-    with suppress(RuntimeError):  # ~ and the name of nobody: a file may be named so
-        path = path.expanduser()
-    named = [Path(os.environ[name]) for name in ("KALMARK_DATA", "KALMARK_ORACLE") if os.environ.get(name)]
-    places = [folder / path for folder in (Path(base or ""), *named, cache_folder())]  # an absolute path stays as it is
-    places += [folder.parent / path for folder in named if path.parts[:1] == (folder.name,)]
-    for place in places:
-        if place.exists():
-            return place
-    looked = " or ".join(dict.fromkeys(str(place.absolute()) for place in places))
+def how_to_get(path: Path) -> str:
+    """Return how a log that is not found at a relative path can be had, "" if it is none of these datasets."""
     known = [one.name for one in list_data() if f"{path.as_posix()}/".startswith(f"{one.name.split('/')[0]}/")]
-    own = next((copy for copy in OWN_COPIES if path.parts[:1] == (copy.name,)), None)
-    hint = f"; `kalmark data fetch {known[0]}` downloads it" if known else f"; put {own.put}" if own else ""
-    if own is None and not os.environ.get("KALMARK_DATA"):
-        hint += "; KALMARK_DATA can name a folder that has it"
-    raise LogError(f"log {str(path)!r} not found, expected it at {looked}{hint}")
+    if known:
+        return f"`kalmark data fetch {known[0]}` downloads it"
+    return next((f"put {copy.put}" for copy in OWN_COPIES if path.parts[:1] == (copy.name,)), "")

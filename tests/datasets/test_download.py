@@ -18,9 +18,10 @@ import pytest
 import requests
 from urllib3.exceptions import MaxRetryError, NewConnectionError, ReadTimeoutError
 
+from kalmark.datasets import download
+from kalmark.datasets.download import DataFile, Dataset
 from kalmark.errors import DataError, LogError
-from kalmark.logs import cache_folder, download, fetch, find_data, list_data
-from kalmark.logs.download import DataFile, Dataset
+from kalmark.logs import cache_folder, fetch, find_data, list_data
 
 FILES = {"toy/one/a.csv": b"a" * 200_000, "toy/one/deep/b.csv": b"b" * 1000, "toy/two/c.csv": b"c" * 10}
 
