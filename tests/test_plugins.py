@@ -213,7 +213,12 @@ from pathlib import Path
 import kalmark as km
 from kalmark.cli import main
 from kalmark.config import load_config
+from kalmark.logs import Log, write_native
+import numpy as np
 
+images = Log("film", ("r",), [km.Frame(t_s=0.0, robot="r", sensor="eye", image=np.zeros((2, 2), np.uint8))])
+Path("film").mkdir()
+Path("film/frames.csv").write_text("t_s,robot,sensor,image\\n0,r,eye,0.png\\n")
 Path("log").mkdir()
 Path("log/controls.csv").write_text("t_s,robot,v_mps,w_radps\\n0,r,1,0\\n")
 for call in (
@@ -224,6 +229,8 @@ for call in (
     lambda: km.diagnose,
     lambda: km.detect.Tags,
     lambda: km.open_log("dlr"),
+    lambda: km.open_log("film"),
+    lambda: write_native(images, "copy"),
 ):
     try:
         call()
@@ -234,7 +241,7 @@ print([main([verb, "x", "--option", "1"]) for verb in ("bag", "data", "diagnose"
 """
     monkeypatch.delenv("KALMARK_DATA", raising=False)
     done = python(WITHOUT + code, tmp_path)
-    mrclam, unknown, detector, tags, name, tags_name, dlr, statuses = done.stdout.splitlines()
+    mrclam, unknown, detector, tags, name, tags_name, dlr, film, copy, statuses = done.stdout.splitlines()
     assert statuses == "[2, 2, 2, 2]"
     assert mrclam.startswith("log format is 'mrclam': 'mrclam' of kalmark.datasets.mrclam:MRCLAM cannot be loaded: ")
     assert f"'bag' of kalmark.bags.importer:BAG cannot be loaded: No module named 'kalmark.bags'{AGAIN}" in unknown
@@ -244,6 +251,8 @@ print([main([verb, "x", "--option", "1"]) for verb in ("bag", "data", "diagnose"
     assert tags_name.startswith("'detect.Tags' of kalmark.vision.apriltags:Tags cannot be loaded")
     assert dlr.startswith("log 'dlr' not found, expected it at ")
     assert "downloads it" not in dlr
+    assert film == copy
+    assert film.startswith("'frames.csv' of kalmark.vision.frames_table cannot be loaded: No module named")
     assert name.startswith("'diagnose' of kalmark.diagnosis.verdict:diagnose cannot be loaded")
     assert "kalmark: 'mcap' of kalmark.bags.run_messages:export cannot be loaded" in done.stderr
     tune = "kalmark: 'tune' of kalmark.diagnosis.tune_verb:tune cannot be loaded: No module named 'kalmark.diagnosis'"

@@ -3,6 +3,8 @@
 | group | entry |
 |---|---|
 | `kalmark.formats` | a `kalmark.logs.source.Format` of logs, under its name |
+| `kalmark.tables` | a file of native logs: a module with `read(path, request, note)` and `rows(log, folder)` |
+| `kalmark.checks` | a check of raw data: `(config, key, robot, log)`, which raises ConfigError |
 | `kalmark.models` | a module that registers models (`kalmark.register`) |
 | `kalmark.layouts` | a layout of simulated worlds, under its `type` |
 | `kalmark.keys` | a key of sensors: a module with `complete(tree)` and `with_events(config, log)` |

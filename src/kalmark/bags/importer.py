@@ -44,11 +44,11 @@ from kalmark.geometry import rotations
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.geodesy import fault, to_tangent_plane
-from kalmark.logs.image_files import Forward
 from kalmark.logs.log import Log, Names, PositionTrack, Section, SensorKey, Trajectory, poses_of_size
 from kalmark.logs.source import Format, Request
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import BEAM, POSE3, POSITION
+from kalmark.vision.image_files import Forward
 
 FOREVER_S = 1e9
 DAY_NS = 86_400_000_000_000

@@ -20,10 +20,9 @@ from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, declared_options, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
-from kalmark.events import Control, Frame, Raw, Scan
+from kalmark.events import Control, Raw, Scan
 from kalmark.geometry.named_poses import pose_of, world_of
 from kalmark.logs.formats import known_formats
-from kalmark.logs.image_files import image_size
 from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
 from kalmark.logs.log import Log
 from kalmark.models.inertial import Inertial, start_at_rest
@@ -32,6 +31,7 @@ from kalmark.models.landmarks import PointHeight2D
 from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import state_columns
 from kalmark.picture_options import USUAL, Picture
+from kalmark.plugins import load_all
 from kalmark.slam.description import EXACT, covariance_of, describe_place, state_of
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
@@ -168,7 +168,9 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
     if log is not None:
         refuse_scans(config, key, name, mounts, log)
-        refuse_uncalibrated(config, key, name, log)
+        if any(isinstance(event, Raw) and event.robot == name for event in log.events):
+            for check in load_all("checks")[0].values():
+                check(config, key, name, log)
     own = {each.name: getattr(robot, each.name) for each in declared_options(Robot)} | rests | {"motion": moves}
     return _made(config, path, Robot, name, start=start, sensors=mounts, cov=cov, **own)
 
@@ -294,27 +296,6 @@ def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], 
     known = f"one of {', '.join(mounts)}" if mounts else "none, as none is configured"
     what = f"{name} has scans of the sensor {other!r}, expected {known}"
     raise LogError(f"{where}: {what}; if it is another one, add robots.{key}.sensors.{other}")
-
-
-def refuse_uncalibrated(config: Config, key: str, name: str, log: Log) -> None:
-    """Refuse images by a camera whose calibration nobody gave, or that is for images of another size."""
-    took: dict[str, list[Frame]] = {}
-    for event in log.events:
-        if isinstance(event, Frame) and event.robot == name:
-            took.setdefault(event.sensor, []).append(event)
-    for sensor, frames in took.items():
-        section = config.robots[key].sensors.get(sensor)
-        if section is None or "fx_px" not in type(section).model_fields:
-            continue
-        where = ("robots", key, "sensors", sensor)
-        if "fx_px" not in section.model_fields_set:
-            wanted = f"fx_px, ..., or {'.'.join((*where, 'calibration'))}: a file of OpenCV, ROS, Kalibr or EuRoC"
-            raise config.error(where, f"got images by a camera without a calibration, expected {wanted}")
-        size = image_size(frames)
-        if any(getattr(section, name) != pixels for name, pixels in size.items()):
-            got = f"got a calibration for {section.width_px:g} x {section.height_px:g} px"
-            wanted = " x ".join(map(str, size.values()))
-            raise config.error(where, f"{got}, expected one for the images of {wanted} px")
 
 
 def _other_columns(

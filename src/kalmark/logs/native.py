@@ -9,8 +9,9 @@
 `landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags;
                 in the plane id, x_m, y_m[, x2_m, y2_m]: points, both ends of walls
 `gps.csv`       t_s, robot, x_m, y_m, antenna_x_m, antenna_y_m: fixes that only score a run
-`frames.csv`    t_s, robot, sensor, image[, depth][, right]: files beside it, depths of 16 bits, 5000 a metre
 `rig.yaml`      what the log describes of its robots and sensors, in the shape of a configuration
+
+Plug-ins add tables (`kalmark.tables`), as `frames.csv` of images.
 
 A row of `scans.csv` whose id and values are all empty is a scan that saw nothing.
 
@@ -28,6 +29,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from functools import partial
 from heapq import merge
 from itertools import groupby
 from pathlib import Path
@@ -38,18 +40,21 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.declare import classes, is_own
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, fixed_seconds, short_text, sort_events, sort_key
+from kalmark.events import Control, Event, Fix, Id, Scan, fixed_seconds, short_text, sort_events, sort_key
 from kalmark.logs.geodesy import Globe, origin_of
-from kalmark.logs.image_files import Album
 from kalmark.logs.log import LandmarkPlaces, Log, Names, PositionTrack, Section, SensorKey, Trajectory
 from kalmark.logs.source import Format, Request, folder_of, read_mapping, spelling_hint
 from kalmark.logs.table import PARQUET, Content, Refused, Row, read_table
 from kalmark.logs.table_columns import CANONICAL, CONTROL, GPS, POSE2, POSE3, POSITION
+from kalmark.plugins import entry_points_of, load
 
 RIG = "rig.yaml"
-FILES = ("controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv",
-         "frames.csv")  # fmt: skip
-EVENTS = ("controls.csv", "scans.csv", "fixes.csv", "measurements.csv", "frames.csv")
+TABLES = tuple(entry_points_of("tables"))
+"""The tables of plug-ins: files of events."""
+FILES = (
+    "controls.csv", "scans.csv", "fixes.csv", "truth.csv", "landmarks.csv", "gps.csv", "measurements.csv", *TABLES
+)  # fmt: skip
+EVENTS = ("controls.csv", "scans.csv", "fixes.csv", "measurements.csv", *TABLES)
 LANDMARK3 = (*POSITION, "x2_m", "y2_m", "z2_m", *POSE3[3:])
 WALL = ("x_m", "y_m", "x2_m", "y2_m")
 LANDMARKS = (POSITION[:2], WALL, POSITION, LANDMARK3[:6], POSE3)
@@ -166,7 +171,7 @@ class _NativeReader:
         self.gps: dict[str, PositionTrack] = {}
         self.readers: tuple[Callable[[Path | Content], Iterator[Event] | None], ...] = (
             self.controls, self.scans, self.fixes, self.read_truth, self.read_landmarks, self.read_gps,
-            self.measurements, self.frames,
+            self.measurements, *(partial(self.of_plugin, name) for name in TABLES),
         )  # fmt: skip
 
     def note(self, row: Row) -> None:
@@ -247,21 +252,10 @@ class _NativeReader:
         table = read_table(path, ("t_s", "robot", "sensor"), known=known_columns(), globe=self.globe)
         return table.made(self.request, make, by_sensor=True)
 
-    def frames(self, path: Path | Content) -> Iterator[Event]:
-        """Yield the frames of `frames.csv`, without those whose images cannot be used."""
-        folder, album = Path(str(path)).parent, Album()
-
-        def make(row: Row) -> Frame | None:
-            self.note(row)
-            if not row.text("image"):
-                raise Refused("image is empty, expected a file beside this one")
-            told = (row.text(name) if name in row.table.index else "" for name in ("depth", "right"))
-            depth, right = (folder / name if name else None for name in told)
-            return album.frame(row.t_ns, row.robot, row.sensor, folder / row.text("image"), depth, right)
-
-        table = read_table(path, ("t_s", "robot", "sensor", "image"), allowed=("depth", "right"))
-        yield from table.made(self.request, make, by_sensor=True)
-        album.report(self.request)
+    def of_plugin(self, name: str, path: Path | Content) -> Iterator[Event]:
+        """Return the events of a table of a plug-in.  Raises PluginError."""
+        events: Iterator[Event] = load("tables", name).read(path, self.request, self.note)
+        return events
 
     def fixes(self, path: Path | Content) -> Iterator[Event]:
         """Yield the absolute positions of `fixes.csv`."""

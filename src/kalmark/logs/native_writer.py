@@ -12,18 +12,16 @@ from ruamel.yaml import YAML
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Fix, Frame, Id, Scan, fixed_seconds
+from kalmark.events import Control, Event, Fix, Id, Raw, Scan, fixed_seconds
 from kalmark.files import replace_folder
-from kalmark.logs.image_files import write_depth, write_image
 from kalmark.logs.log import Log, Names
-from kalmark.logs.native import FILES, LANDMARKS, RIG
+from kalmark.logs.native import FILES, LANDMARKS, RIG, TABLES
 from kalmark.logs.source import landmark_id, nanoseconds_of_text
 from kalmark.logs.table import PARQUET, cov_columns
 from kalmark.logs.table_columns import CANONICAL, GPS, NAMES, POSE2, POSE3, POSITION
+from kalmark.plugins import load
 
 Row = dict[str, Any]
-FRAMES, IMAGES = "frames.csv", "images"
-PICTURES = "image", "depth", "right"  # columns of FRAMES that name files
 
 
 def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path:
@@ -48,8 +46,10 @@ def write_native(log: Log, folder: Path | str, *, parquet: bool = False) -> Path
 def _fill(folder: Path, log: Log, parquet: bool) -> None:
     tables = {  # measurements.csv: what has no id is written into scans.csv, too
         "controls.csv": controls(log), "scans.csv": scans(log), "fixes.csv": fixes(log), "truth.csv": truth(log),
-        "landmarks.csv": landmarks(log), "gps.csv": gps(log), FRAMES: frames(log, folder),
+        "landmarks.csv": landmarks(log), "gps.csv": gps(log),
     }  # fmt: skip
+    if any(isinstance(event, Raw) for event in log):
+        tables |= {name: load("tables", name).rows(log, folder) for name in TABLES}
     for file_name, made in tables.items():
         rows = [*made]
         if not rows:
@@ -62,7 +62,7 @@ def _fill(folder: Path, log: Log, parquet: bool) -> None:
                     f"columns {', '.join(used)} would be read back in another order, expected that of "
                     f"{', '.join(there)}"
                 )
-        if parquet and file_name != FRAMES:
+        if parquet and file_name not in TABLES:
             write_parquet((folder / file_name).with_suffix(PARQUET), header, rows)
             continue
         with (folder / file_name).open("w", newline="", encoding="utf-8") as file:
@@ -77,7 +77,7 @@ def _fill(folder: Path, log: Log, parquet: bool) -> None:
 def header_of(rows: Sequence[Row]) -> list[str]:
     """Return the columns of a table: names, numbers in the order in which they are read back, noise."""
     names = dict.fromkeys(name for row in rows for name in row)
-    known = [name for name in (*NAMES, *CANONICAL, *PICTURES) if name in names]
+    known = [name for name in (*NAMES, *CANONICAL) if name in names]
     noise = sorted(name for name in names if name.startswith("cov_"))
     return [*known, *(name for name in names if name not in (*known, *noise)), *noise]
 
@@ -127,23 +127,6 @@ def scans(log: Log) -> Iterator[Row]:
         for y, id_, of, cov in zip(s.y, s.ids or [None] * count, s.classes or [None] * count, covs, strict=True):
             own = numbers(log.sensor_columns, (s.robot, s.sensor), y) | upper_triangle(cov, f"scan at {s.t_s} s")
             yield begin | ({} if id_ is None else {"id": id_text(id_)}) | ({} if of is None else {"class": of}) | own
-
-
-def frames(log: Log, folder: Path) -> Iterator[Row]:
-    """Yield the rows of frames.csv, and write the images below the folder: IMAGES/SENSOR/NANOSECONDS.png."""
-    for frame in log:
-        if not isinstance(frame, Frame):
-            continue
-        row = time_and_robot(frame) | {"sensor": name(frame.sensor)}
-        told = frame.pixels(), frame.depths(), frame.right_grey()
-        for column, pixels, write in zip(PICTURES, told, (write_image, write_depth, write_image), strict=True):
-            if pixels is None:
-                continue
-            place = Path(IMAGES, f"{frame.robot}_{frame.sensor}".replace("/", "_"), f"{frame.t_ns}_{column}.png")
-            (folder / place).parent.mkdir(parents=True, exist_ok=True)
-            write(folder / place, pixels)
-            row[column] = place.as_posix()
-        yield row
 
 
 def fixes(log: Log) -> Iterator[Row]:

@@ -18,7 +18,7 @@ from PIL import Image, ImageDraw
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.rotations import matrix
-from kalmark.logs.image_files import DEPTH_SCALE
+from kalmark.vision.image_files import DEPTH_SCALE
 
 Bytes = np.ndarray[Any, np.dtype[np.uint8]]
 Floats = np.ndarray[Any, np.dtype[np.float32]]

@@ -19,7 +19,6 @@ from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, came
 from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.events import Frame, short_text
-from kalmark.logs.image_files import ENDINGS, Forward, frames_of, video_facts, video_images
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.poses import kitti_rows, read_path
 from kalmark.logs.source import (
@@ -31,6 +30,7 @@ from kalmark.logs.source import (
     rows_in_time,
     text_rows,
 )
+from kalmark.vision.image_files import ENDINGS, Forward, frames_of, video_facts, video_images
 
 VIDEOS = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ogv")
 TIMES = "times.txt"

@@ -9,9 +9,9 @@ from typing import Any
 from kalmark.errors import LogError
 from kalmark.events import Event, Frame
 from kalmark.logs.camera_calibration import read_calibration
-from kalmark.logs.image_files import image_size
 from kalmark.logs.log import Log, Names, Section
 from kalmark.logs.source import Request, one_robot, rows_in_time
+from kalmark.vision.image_files import image_size
 
 ROBOT, CAMERA = "robot", "camera"
 MOTION = {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 1.0, "sigma_w_radps_per_sqrt_s": 2.0}
