@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from kalmark.config import load_config
-from kalmark.config.data_sheets import calibration
 from kalmark.errors import ConfigError
 from kalmark.geometry.frames3d import from_euler_pose
 from kalmark.models.sensors import PinHole
+from kalmark.vision.calibration_key import calibration
 
 OPENCV = """%YAML:1.0
 ---

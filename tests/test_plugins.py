@@ -61,6 +61,44 @@ def with_events(config, log):
             raise config.error(("robots", "each", "sensors", name, "stop"), f"got {sensor.stop!r}, expected a stop")
     return log
 '''
+TICKETS = '''"""The table `tickets.csv` of native logs: t_s, robot, sensor, stops."""
+from dataclasses import dataclass
+
+from kalmark.events import Raw, fixed_seconds
+from kalmark.logs.table import read_table
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Ticket(Raw):
+    stops: int
+
+
+def read(path, request, note):
+    def make(row):
+        note(row)
+        return Ticket(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, stops=int(row.text("stops")))
+
+    return read_table(path, ("t_s", "robot", "sensor", "stops")).made(request, make, by_sensor=True)
+
+
+def rows(log, folder):
+    for e in log.events:
+        if isinstance(e, Ticket):
+            yield {"t_s": fixed_seconds(e.t_ns), "robot": e.robot, "sensor": e.sensor, "stops": e.stops}
+
+
+def refuse_free(config, key, robot, log):
+    if any(isinstance(e, Ticket) and not e.stops for e in log.events):
+        raise config.error(("robots", key, "sensors"), "got a ticket of no stop, expected one of some")
+
+
+def fits(kind):
+    return kind == "range_bearing"
+
+
+def values(given, folder, kind):
+    return {"sigma_range_m": float((folder / given).read_text())}
+'''
 POINTS = """[kalmark.formats]
 tram = trams:TRAM
 broken = trams:NOTHING
@@ -80,6 +118,15 @@ logs.TRAM = trams:TRAM
 
 [kalmark.data]
 trams = trams:how_to_get
+
+[kalmark.tables]
+tickets.csv = tickets
+
+[kalmark.checks]
+tickets = tickets:refuse_free
+
+[kalmark.sheets]
+fares = tickets
 """
 AGAIN = "; expected it installed: pip install --force-reinstall --no-deps kalmark"
 OUTSIDE = ("kalmark.bags", "kalmark.datasets", "kalmark.diagnosis", "kalmark.viewer", "kalmark.vision")
@@ -117,6 +164,7 @@ def trams(tmp_path: Path) -> Path:
     """Return a folder with an installed package, as pip leaves one."""
     (tmp_path / "trams.py").write_text(OWN)
     (tmp_path / "stops.py").write_text(KEY)
+    (tmp_path / "tickets.py").write_text(TICKETS)
     (tmp_path / "trams-1.dist-info").mkdir()
     (tmp_path / "trams-1.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: trams\nVersion: 1\n")
     (tmp_path / "trams-1.dist-info" / "entry_points.txt").write_text(POINTS)
@@ -187,6 +235,33 @@ except KalmarkError as error:
     assert wrong.endswith("wrong.yaml:2:84: robots.each.sensors.laser.stop: got 'Station', expected a stop")
 
 
+def test_a_package_adds_a_table_of_native_logs_a_check_of_its_raw_data_and_a_file_of_parameters(trams: Path) -> None:
+    (trams / "log").mkdir()
+    (trams / "log" / "controls.csv").write_text("t_s,robot,v_mps,w_radps\n0,r,1,0\n")
+    (trams / "log" / "tickets.csv").write_text("t_s,robot,sensor,stops\n1,r,gate,2\n2,r,gate,0\n")
+    (trams / "fares.txt").write_text("0.5")
+    gate = "{type: range_bearing, fares: fares.txt}"
+    (trams / "log.yaml").write_text(f"log: {{path: log}}\nrobots: {{each: {{sensors: {{gate: {gate}}}}}}}\n")
+    code = """
+from kalmark import KalmarkError
+from kalmark.config import build_slam, open_run
+from kalmark.logs import open_log, write_native
+
+config, log = open_run("log.yaml")
+print(config.robots["each"].sensors["gate"].sigma_range_m)
+write_native(log, "copy")
+print([event.stops for event in open_log("copy").events[1:]])
+try:
+    build_slam(config, log)
+except KalmarkError as error:
+    print(error)
+"""
+    done = python(code, trams)
+    sigma, stops, refused = done.stdout.splitlines()
+    assert (sigma, stops) == ("0.5", "[2, 0]"), done.stderr
+    assert refused.endswith("robots.each.sensors: got a ticket of no stop, expected one of some")
+
+
 def test_the_core_simulates_runs_saves_and_reloads_without_the_plug_ins(tmp_path: Path) -> None:
     done = python(WITHOUT + CORE, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -206,6 +281,9 @@ def test_what_needs_a_part_that_is_missing_names_it_in_one_line(
     )
     (tmp_path / "tags.yaml").write_text(
         "robots: {r: {motion: {type: odometry_3d}, sensors: {eye: {type: tag_corners, detector: {type: tags}}}}}\n"
+    )
+    (tmp_path / "lens.yaml").write_text(
+        "robots: {r: {motion: {type: odometry_3d}, sensors: {eye: {type: pinhole, calibration: lens.yaml}}}}\n"
     )
     code = """
 import sys
@@ -229,6 +307,7 @@ for call in (
     lambda: km.diagnose,
     lambda: km.detect.Tags,
     lambda: km.open_log("dlr"),
+    lambda: load_config("lens.yaml"),
     lambda: km.open_log("film"),
     lambda: write_native(images, "copy"),
 ):
@@ -241,7 +320,7 @@ print([main([verb, "x", "--option", "1"]) for verb in ("bag", "data", "diagnose"
 """
     monkeypatch.delenv("KALMARK_DATA", raising=False)
     done = python(WITHOUT + code, tmp_path)
-    mrclam, unknown, detector, tags, name, tags_name, dlr, film, copy, statuses = done.stdout.splitlines()
+    mrclam, unknown, detector, tags, name, tags_name, dlr, lens, film, copy, statuses = done.stdout.splitlines()
     assert statuses == "[2, 2, 2, 2]"
     assert mrclam.startswith("log format is 'mrclam': 'mrclam' of kalmark.datasets.mrclam:MRCLAM cannot be loaded: ")
     assert f"'bag' of kalmark.bags.importer:BAG cannot be loaded: No module named 'kalmark.bags'{AGAIN}" in unknown
@@ -251,6 +330,7 @@ print([main([verb, "x", "--option", "1"]) for verb in ("bag", "data", "diagnose"
     assert tags_name.startswith("'detect.Tags' of kalmark.vision.apriltags:Tags cannot be loaded")
     assert dlr.startswith("log 'dlr' not found, expected it at ")
     assert "downloads it" not in dlr
+    assert lens.startswith("'calibration' of kalmark.vision.calibration_key cannot be loaded")
     assert film == copy
     assert film.startswith("'frames.csv' of kalmark.vision.frames_table cannot be loaded: No module named")
     assert name.startswith("'diagnose' of kalmark.diagnosis.verdict:diagnose cannot be loaded")

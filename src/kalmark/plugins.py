@@ -4,6 +4,7 @@
 |---|---|
 | `kalmark.formats` | a `kalmark.logs.source.Format` of logs, under its name |
 | `kalmark.tables` | a file of native logs: a module with `read(path, request, note)` and `rows(log, folder)` |
+| `kalmark.sheets` | a key of sensors, a file of parameters: a module with `fits(type)`, `values(given, folder, type)` |
 | `kalmark.checks` | a check of raw data: `(config, key, robot, log)`, which raises ConfigError |
 | `kalmark.models` | a module that registers models (`kalmark.register`) |
 | `kalmark.layouts` | a layout of simulated worlds, under its `type` |

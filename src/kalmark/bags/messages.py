@@ -21,10 +21,10 @@ from kalmark.arrays import Array
 from kalmark.bags.bag_opening import header_time
 from kalmark.bags.topics import Scans
 from kalmark.events import unit_quaternion
-from kalmark.logs.camera_calibration import lens
 from kalmark.logs.log import Names, Section
 from kalmark.logs.table import Refused
 from kalmark.logs.table_columns import BEAM, CORNERS, POSE3, POSITION
+from kalmark.vision.camera_calibration import lens
 
 NO_FIX = 0  # of NavSatStatus: what is below has no fix
 UNKNOWN_COVARIANCE = 0

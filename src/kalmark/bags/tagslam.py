@@ -24,7 +24,6 @@ from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import matrix
-from kalmark.logs.camera_calibration import INTRINSICS, lens
 from kalmark.logs.known_map import TAG, KnownLandmark
 from kalmark.logs.log import LandmarkPlaces, Log, Section, Trajectory
 from kalmark.logs.source import (
@@ -37,6 +36,7 @@ from kalmark.logs.source import (
     vector_frame,
 )
 from kalmark.logs.table_columns import CORNERS, INCREMENT3
+from kalmark.vision.camera_calibration import INTRINSICS, lens
 
 ROBOT = "rig"
 FILES = ("tagslam.yaml", "cameras.yaml", "camera_poses.yaml", "tag_detections.bag", "tag_detections.bag.bz2")

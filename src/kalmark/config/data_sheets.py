@@ -1,20 +1,18 @@
-"""Files that a configuration names: of a motion Kalibr's `imu.yaml` or a preset; of a camera its `calibration`."""
+"""Files that a configuration names: of a motion Kalibr's `imu.yaml` or a preset; of sensors those of plug-ins."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from kalmark.config.tree import KeyPath, Tree, folder_beside, quote_value
+from kalmark.config.tree import KeyPath, Plain, Tree, folder_beside, quote_value
 from kalmark.declare import class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
 from kalmark.events import is_number, largest_magnitude
-from kalmark.logs.camera_calibration import INTRINSICS, read_calibration
 from kalmark.logs.source import read_mapping
+from kalmark.plugins import entry_points_of, load
 
-KEY, CALIBRATION = "data_sheet", "calibration"
+KEY = "data_sheet"
 NAMES = (
     "gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density", "accelerometer_random_walk",
 )  # fmt: skip
@@ -48,17 +46,6 @@ def _density(path: Path, name: str, value: Any) -> float:
     return float(value)
 
 
-def calibration(path: str | Path, camera: str | None = None) -> dict[str, Any]:
-    """Return a camera's calibration (OpenCV, Kalibr, ROS, EuRoC) as parameters of `pinhole`; its mount as `mount`.
-
-    `camera` names one of several in the file.  Raises ConfigError: file, key, value and what was expected.
-    """
-    try:
-        return read_calibration(Path(path), camera)
-    except LogError as error:
-        raise ConfigError(str(error)) from None
-
-
 def take_data_sheets(tree: Tree, path: Path | None) -> None:
     """Put what is in each `data_sheet` and `calibration` that a tree, read from the file `path`, names in its place.
 
@@ -69,17 +56,33 @@ def take_data_sheets(tree: Tree, path: Path | None) -> None:
     for name, robot in robots.items() if isinstance(robots, dict) else ():
         if not isinstance(robot, dict):
             continue
-        _take_preset(tree, ("robots", name, "motion"), robot.get("motion"))
-        _take(tree, path, ("robots", name, "motion"), robot.get("motion"))
-        sensors = robot.get("sensors")
+        where, motion, sensors = ("robots", name, "motion"), robot.get("motion"), robot.get("sensors")
+        if isinstance(motion, dict) and {"preset", KEY} & motion.keys():
+            _take_motion(tree, path, where, motion)
         for sensor, section in sensors.items() if isinstance(sensors, dict) else ():
-            _take(tree, path, ("robots", name, "sensors", sensor), section)
+            for key in entry_points_of("sheets") if isinstance(section, dict) else ():
+                if key in section and load("sheets", key).fits(section.get("type")):
+                    _take_sheet(tree, path, ("robots", name, "sensors", sensor), section, key)
 
 
-def _take_preset(tree: Tree, where: KeyPath, section: Any) -> None:
-    """Put the numbers of the device that a motion names as its `preset` in its place."""
-    if not isinstance(section, dict) or "preset" not in section or not _has_one(KEY, section.get("type")):
+def has_parameter(role: str, kind: Any, name: str) -> bool:
+    """Return whether a type has a parameter."""
+    models = classes(role).get(kind, []) if isinstance(kind, str) else []
+    return any(own.name == name for model in models for own in parameters(model))
+
+
+def _take_motion(tree: Tree, path: Path | None, where: KeyPath, section: Plain) -> None:
+    """Put the numbers of the `preset` of a motion, and those of its `data_sheet`, in their places."""
+    if not has_parameter("motion", section.get("type"), _parameter(NAMES[0])):
         return
+    if "preset" in section:
+        _take_preset(tree, where, section)
+    if KEY in section:
+        _take_sheet(tree, path, where, section, KEY)
+
+
+def _take_preset(tree: Tree, where: KeyPath, section: Plain) -> None:
+    """Put the numbers of the device that a motion names as its `preset` in its place."""
     from kalmark.presets import MOTIONS
 
     place, given = tree.place((*where, "preset")), section.pop("preset")
@@ -91,37 +94,19 @@ def _take_preset(tree: Tree, where: KeyPath, section: Any) -> None:
     section |= {name: getattr(unit, name) for name in MOTIONS[given].sources if name in names} | section
 
 
-def _take(tree: Tree, path: Path | None, where: KeyPath, section: Any) -> None:
-    """Replace the file of a motion or a sensor by its values."""
-    key = KEY if where[-1] == "motion" and len(where) == 3 else CALIBRATION
-    if not isinstance(section, dict) or key not in section or not _has_one(key, section.get("type")):
-        return
+def _take_sheet(tree: Tree, path: Path | None, where: KeyPath, section: Plain, key: str) -> None:
+    """Replace the file that a motion or a sensor names at a key by its values."""
+    values_of = _values if key == KEY else load("sheets", key).values
     place, given = tree.place((*where, key)), section.pop(key)
-    name = f"{place}: {'.'.join((*where, key))}"
-    file, camera = given, None
-    if key == CALIBRATION and isinstance(given, dict) and given.keys() == {"file", "camera"}:
-        file, camera = given["file"], str(given["camera"])
-    if not isinstance(file, str):
-        of_camera = "the path of a camera's calibration, or {file: PATH, camera: NAME}"
-        wanted = "the path of Kalibr's imu.yaml" if key == KEY else of_camera
-        raise ConfigError(f"{name}: got {quote_value(given)}, expected {wanted}")
-    there = folder_beside(path, place) / file
     try:
-        found = data_sheet(there) if key == KEY else calibration(there, camera)
+        found = values_of(given, folder_beside(path, place), section.get("type"))
     except ConfigError as error:
-        raise ConfigError(f"{name}: {error}") from None
-    if key == CALIBRATION and not _has("sensor", section["type"], "lens"):
-        if np.any(found["distortion"]):
-            raise ConfigError(f"{name}: got a lens with distortion, expected one without: {section['type']} has none")
-        found = {own: value for own, value in found.items() if own not in ("lens", "distortion")}
+        raise ConfigError(f"{place}: {'.'.join((*where, key))}: {error}") from None
     section |= found | section
 
 
-def _has_one(key: str, kind: Any) -> bool:
-    """Return whether a type of motion has the parameters of a data sheet, or one of sensor those of a calibration."""
-    return _has("motion", kind, _parameter(NAMES[0])) if key == KEY else _has("sensor", kind, INTRINSICS[0])
-
-
-def _has(role: str, kind: Any, name: str) -> bool:
-    models = classes(role).get(kind, []) if isinstance(kind, str) else []
-    return any(own.name == name for model in models for own in parameters(model))
+def _values(given: Any, folder: Path, _: Any) -> dict[str, float]:
+    """Return the parameters of a motion by the file that it names.  Raises ConfigError."""
+    if not isinstance(given, str):
+        raise ConfigError(f"got {quote_value(given)}, expected the path of Kalibr's imu.yaml")
+    return data_sheet(folder / given)

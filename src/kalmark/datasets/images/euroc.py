@@ -20,11 +20,11 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Frame, short_text
 from kalmark.files import unpack_file
 from kalmark.geometry.named_poses import describe_pose
-from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.log import Log, Names, Section, Times, Trajectory, interpolate
 from kalmark.logs.source import Format, Request, number_of_text, one_of, read_text, rows_in_time
 from kalmark.logs.table_columns import INERTIAL, TWIST3
 from kalmark.models.motion import noise_densities
+from kalmark.vision.camera_calibration import read_calibration
 from kalmark.vision.image_files import frames_of
 
 TRUE_STATES = "state_groundtruth_estimate0/data.csv"

@@ -14,10 +14,10 @@ import numpy as np
 from kalmark.datasets.images.folder import TIMES, images_in, read_times
 from kalmark.datasets.images.rigs import CAMERA, ROBOT, camera_log, camera_section
 from kalmark.errors import LogError
-from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.log import Log, Section, Trajectory
 from kalmark.logs.poses import kitti_rows
 from kalmark.logs.source import Format, Request, number_of_text, text_rows
+from kalmark.vision.camera_calibration import INTRINSICS
 from kalmark.vision.image_files import frames_of
 
 FOLDERS = "image_0", "image_2"  # of the left grey and the left colour camera

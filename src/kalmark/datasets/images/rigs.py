@@ -8,9 +8,9 @@ from typing import Any
 
 from kalmark.errors import LogError
 from kalmark.events import Event, Frame
-from kalmark.logs.camera_calibration import read_calibration
 from kalmark.logs.log import Log, Names, Section
 from kalmark.logs.source import Request, one_robot, rows_in_time
+from kalmark.vision.camera_calibration import read_calibration
 from kalmark.vision.image_files import image_size
 
 ROBOT, CAMERA = "robot", "camera"

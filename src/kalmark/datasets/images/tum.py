@@ -14,10 +14,10 @@ import numpy as np
 
 from kalmark.datasets.images.rigs import CAMERA, ROBOT, calibration_beside, camera_log, camera_section, files_by_time
 from kalmark.declare import Within
-from kalmark.logs.camera_calibration import INTRINSICS
 from kalmark.logs.log import Log, Section
 from kalmark.logs.poses import read_path
 from kalmark.logs.source import Format, Request, text_rows
+from kalmark.vision.camera_calibration import INTRINSICS
 from kalmark.vision.image_files import DEPTH_SCALE, frames_of
 
 NEAR_NS = 20_000_000
