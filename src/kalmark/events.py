@@ -128,14 +128,14 @@ def finite(value: Any, what: str, limit: float = MOST["m"], error: type[KalmarkE
     return finite_and_largest(value, what, limit, error)[0]
 
 
-def unit_quaternion(q: Array, error: type[Exception] = EventError) -> Array:
+def unit_quaternion(q: Array, error: type[Exception] = EventError, of: str = "") -> Array:
     """Return a quaternion (4,) normalised; raise `error` if its length is not 1 up to `ROUNDED`, as of few digits.
 
-    One whose length is 1 up to the last digits of a double is returned as it is.
+    `of` is the beginning of the message.  One whose length is 1 up to the last digits of a double is returned as it is.
     """
     norm = float(np.linalg.norm(q))
     if not abs(norm - 1) <= ROUNDED:
-        raise error(f"quaternion has length {norm:.6g}, expected 1 up to {ROUNDED:g}")
+        raise error(f"{of}quaternion has length {norm:.6g}, expected 1 up to {ROUNDED:g}")
     return q if abs(norm - 1) < 1e-12 else np.asarray(q / norm)
 
 

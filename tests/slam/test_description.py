@@ -16,15 +16,17 @@ import pytest
 
 import kalmark as km
 from kalmark.cli import main
-from kalmark.config import load_config, slam_described
+from kalmark.config import build_slam, load_config, open_run, slam_described
 from kalmark.config.sections import Choice, model_of
 from kalmark.declare import Parameter, built_in, class_of, declared_options, parameters, world_of_class
-from kalmark.errors import ConfigError, KalmarkError, ModelError
+from kalmark.errors import ConfigError, KalmarkError, MapError, ModelError
 from kalmark.geometry.rotations import from_euler
+from kalmark.geometry.spaces import ROTATION
 from kalmark.models.landmark_views import Raised
 from kalmark.results.filter_description import configuration
 from kalmark.results.recording import config_yaml
 from kalmark.slam.description import describe, describe_model
+from kalmark.slam.saving import members_of
 from kalmark.slam.state import Settings
 
 ROLES = (
@@ -232,21 +234,149 @@ def test_a_run_with_every_option_is_the_same_map_by_the_command_line_and_after_l
             np.testing.assert_array_equal(other.mean(name), slam.mean(name), folder)
 
 
-def test_options_of_a_log_and_landmarks_added_in_python_are_in_the_configuration_of_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("kalmark.compiled.say_compiling", lambda: None)
+def test_options_of_a_log_are_in_the_configuration_of_the_run(tmp_path: Path) -> None:
     write_log(tmp_path / "log", {"r": ["s"]}, {"s": ("range_m", "bearing_rad")})
     options = {"from_s": 0.3, "to_s": 1.9, "factors": {"v_mps": 1.1}, "shift_s": {"s": 0.01}}
     log = km.open_log(tmp_path / "log", **options)  # type: ignore[arg-type]
     assert log.options == options | {"on_error": "raise", "ids": "given", "increments": "recorded"}
     slam = km.Slam([km.Robot("r", km.motion.Unicycle(), sensors={"s": km.Mount(SENSORS[0])})])
-    slam.add_landmark(0, PLACES[0], random_covariance(2))
-    slam.add_landmark("post", (1.0 / 3.0, 7.0))
     km.record(slam, log, progress=False, pictures=False).save(tmp_path / "run")
     km.Run.load(tmp_path / "run").save(tmp_path / "copy")
-    assert main(["run", str(tmp_path / "copy" / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
-    texts = [(tmp_path / folder / "landmarks.csv").read_text() for folder in ("run", "copy", "again")]
-    assert texts[0] == texts[1] == texts[2]
-    assert "post,point,0.3333333333333333,7.0" in texts[2]
-    np.testing.assert_array_equal(km.Slam.load(tmp_path / "again" / "map.kmk").mean("r"), slam.mean("r"))
+    again = km.record(*run_again(tmp_path / "copy"), progress=False, pictures=False).slam
+    assert_same_state(again, slam)
+
+
+# ---------------------------------------------------------------------- landmarks known beforehand
+def run_again(folder: Path) -> tuple[km.Slam, km.Log]:
+    """Return the filter and the log that `kalmark run` makes of the configuration in a run folder."""
+    config, log = open_run(folder / "config.yaml")
+    return build_slam(config, log), log
+
+
+def assert_same_state(one: km.Slam | None, other: km.Slam) -> None:
+    """Assert that all that events have made of two filters is the same, to the last bit."""
+    assert one is not None
+    assert members_of(one.state, {}) == members_of(other.state, {})
+
+
+def mean_of(space: Any) -> np.ndarray:
+    """Return numbers of a space that have no short digits, and of a quaternion the length 1."""
+    mean = np.arange(1, space.size + 1) / 7.0
+    for kind, at, _ in space.atoms:
+        if kind == ROTATION:
+            mean[at : at + 4] /= np.linalg.norm(mean[at : at + 4])
+    return mean
+
+
+def add_to(slam: km.Slam, model: Any, name: Any) -> None:
+    """Add a landmark of a type three times: with a covariance, with one of zero, and known exactly."""
+    space = model.space
+    for k, cov in enumerate((random_covariance(space.dof), np.zeros((space.dof, space.dof)), None)):
+        slam.add_landmark(name if k == 0 else f"{name}, {k}", mean_of(space), cov, model)
+
+
+@pytest.mark.parametrize("kind", built_in("landmark"), ids=[kind.__name__ for kind in built_in("landmark")])
+def test_landmarks_of_every_type_are_read_again_with_all_parameters(kind: Any, tmp_path: Path) -> None:
+    moves = {"plane": km.motion.Unicycle(), "space": km.motion.Odometry3D()}[world_of_class(kind)]
+    slam = km.Slam([km.Robot("r", moves, cov=random_covariance(moves.space.dof))])
+    for n, model in enumerate([kind(), *(changed(kind, own.name) for own in parameters(kind))]):
+        add_to(slam, model, n)
+    again = read_again(slam, tmp_path)
+    for other in again:
+        assert_same_state(other, slam)
+        assert [*map(other.landmark_model, other.landmarks().ids)] == [*map(slam.landmark_model, slam.landmarks().ids)]
+
+
+TEXTS = (
+    "0",
+    "007",
+    "1e3",
+    "0x1F",
+    "1_0",
+    "true",
+    "~",
+    "null",
+    "-",
+    "a, b: 'c' #d",
+    " led",
+    "{b}",
+    "*c",
+    "u3",
+    "\u3000é",
+)
+
+
+def test_ids_that_are_numbers_or_texts_are_read_again_as_they_are(tmp_path: Path) -> None:
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle())])
+    for k, name in enumerate((0, -7, 10**20, *TEXTS)):
+        slam.add_landmark(name, (k, 1.0 / 3.0), None if k % 2 else random_covariance(2))
+    for again in read_again(slam, tmp_path):
+        assert_same_state(again, slam)
+        assert [type(name) for name in again.landmarks().ids] == [type(name) for name in slam.landmarks().ids]
+
+
+@pytest.mark.parametrize("map_", ["dense", "postponed"])
+@pytest.mark.parametrize("estimator", [km.estimators.Ekf(), km.estimators.Invariant()])
+def test_the_joint_covariance_of_landmarks_fused_before_the_first_event_is_read_again(
+    estimator: Any, map_: str, tmp_path: Path
+) -> None:
+    robot = km.Robot("r", km.motion.Unicycle(), (0.3, 0.4, 0.5), cov=random_covariance(3))
+    slam = km.Slam([robot], estimator=estimator, map=map_)
+    for name, place in zip("abc", PLACES, strict=True):
+        slam.add_landmark(name, place, random_covariance(2))
+    slam.fuse(["a", "b"], lambda a, b: np.linalg.norm(a - b), 3.2, 0.01)  # a tape measure
+    slam.fuse(["b", "c"], lambda b, c: np.linalg.norm(b - c), 2.2, 0.01)
+    assert slam.covariance("a", "c")[2:, :2].any()
+    again = read_again(slam, tmp_path)[0]
+    np.testing.assert_array_equal(again.covariance(*"rabc"), slam.covariance(*"rabc"))
+    for name in "rabc":
+        np.testing.assert_array_equal(again.mean(name), slam.mean(name))
+
+
+def test_a_joint_covariance_that_is_none_is_refused(tmp_path: Path) -> None:
+    place = "{id: a, mean: [4, 1], cov: [[0.01, 0], [0, 0.01]]}"
+    file = tmp_path / "c.yaml"
+    for shared, said in (
+        ("0.02", "has the eigenvalue -0.01, expected a positive semidefinite"),
+        ("", r"has shape \(3, 5\), expected \(5, 5\)"),
+    ):
+        rows = [[0.0] * 5] * 3 + [[0, 0, 0, 0.01, float(shared or 0)], [0, 0, 0, float(shared or 0), 0.01]]
+        file.write_text(f"map:\n  landmarks: [{place}]\n  cov: {rows if shared else rows[:3]}\n")
+        with pytest.raises(ConfigError, match=rf"c.yaml:3:\d+: map.cov: cov of all that is in the map {said}"):
+            km.Slam.from_config(file)
+
+
+def test_a_tag_whose_quaternion_is_of_another_length_than_1_is_refused() -> None:
+    slam = km.Slam([km.Robot("r", km.motion.Odometry3D())])
+    with pytest.raises(MapError, match=r"landmark 'k': quaternion has length 0\.547723, expected 1 up to 0.001"):
+        slam.add_landmark("k", (5, 1, 0.3, 0.1, 0.2, 0.3, 0.4), None, km.landmarks.Tag())
+    slam.add_landmark("k", (5, 1, 0.3, 0.0, 0.0, 0.6001, 0.8), None, km.landmarks.Tag())
+    assert np.linalg.norm(slam.mean("k")[3:]) == pytest.approx(1.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("world", ["plane", "space"])
+def test_a_run_with_landmarks_of_every_type_is_the_same_map_by_the_command_line(
+    world: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("kalmark.compiled.say_compiling", lambda: None)
+    monkeypatch.setattr("kalmark.cli.run.judge", lambda run: None)
+    motion, sensor, at = {
+        "plane": (km.motion.Unicycle(), km.sensors.RangeBearing(), (0, 0, 0)),
+        "space": (km.motion.Odometry3D(), km.sensors.RangeBearing3D(), (0, 0, 0, 0, 0, 0, 1)),
+    }[world]
+    slam = km.Slam([km.Robot("r", motion, None, {"s": km.Mount(sensor, at)})])
+    for kind in built_in("landmark"):
+        if world_of_class(kind) == world:
+            add_to(slam, kind(), kind.__name__)
+    u, y = ",0.1" * len(motion.columns), ",2.5,0.3,0.2"[: 4 * len(sensor.columns)]
+    (tmp_path / "log").mkdir()
+    rows = [",".join(("t_s,robot", *motion.columns)), *(f"{0.1 * k:.1f},r{u}" for k in range(8))]
+    (tmp_path / "log" / "controls.csv").write_text("\n".join(rows) + "\n")
+    seen = [f"{0.1 * k:.1f},r,s,{name}{y}" for k in range(8) for name in ("new", "Point2D" if u else "")[: 1 + (k > 3)]]
+    rows = [",".join(("t_s,robot,sensor,id", *sensor.columns)), *seen]
+    (tmp_path / "log" / "scans.csv").write_text("\n".join(rows) + "\n")
+    km.record(slam, km.open_log(tmp_path / "log"), progress=False).save(tmp_path / "run")
+    assert main(["run", str(tmp_path / "run" / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
+    assert_same_state(km.Slam.load(tmp_path / "again" / "map.kmk"), km.Slam.load(tmp_path / "run" / "map.kmk"))
+    for table in ("landmarks.csv", "associations.csv"):
+        assert (tmp_path / "run" / table).read_text() == (tmp_path / "again" / table).read_text()

@@ -90,7 +90,8 @@ def test_landmarks_of_several_kinds_are_found_by_name() -> None:
     assert "a" in known and "z" not in known and ["a"] not in known
     assert (known.kind("a"), known.kind("wall"), known.kind("z")) == (POINT.kind, WALL.kind, None)
     assert known.model("wall") is WALL
-    np.testing.assert_array_equal(known.means("ca"), [ROW[2], ROW[0]])
+    np.testing.assert_array_equal(known.means("ca", 2), [ROW[2], ROW[0]])
+    np.testing.assert_array_equal(known.means(["b", "wall"], 2), [ROW[1], LINE[:2]])
     known.mean("a")[:] = 9.0
     np.testing.assert_array_equal(known.mean("a"), ROW[0])  # a copy was changed
 
@@ -101,7 +102,7 @@ def test_after_a_removal_each_name_is_still_what_it_was() -> None:
     known.count("ad", [False, True])
     known.remove("a")
     assert (known.kind("a"), len(known), known.changes) == (None, 4, 6)
-    np.testing.assert_array_equal(known.means("bcd"), ROW[1:])
+    np.testing.assert_array_equal(known.means("bcd", 2), ROW[1:])
     assert [known.observations(name) for name in "bcd"] == [1, 0, 2]
     known.remove("d")
     assert [known.observations(name) for name in "bc"] == [1, 0]

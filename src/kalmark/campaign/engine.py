@@ -81,7 +81,7 @@ def _reasons(world: Any, configs: Mapping[str, Config]) -> Iterator[str]:
 
 def _odd_filter(config: Config, landmarks: int) -> Iterator[str]:
     """Yield the first thing in a filter that the engine does not run."""
-    if config.map.known is not None:
+    if config.map.known is not None or config.map.landmarks:
         yield "has no known maps"
     slam = build_slam(config)
     (robot,), keys = slam.robots.values(), [*slam.state.channels]

@@ -166,7 +166,7 @@ def _on_known_map(config: Config) -> Config:
     }
     trusted = section_of("association", "identity").model_validate({"gate": "off"})
     given = {"association": trusted, "upkeep": section_of("upkeep", "upkeep")()}
-    given["map"] = config.map.model_copy(update={"known": None})  # all of the map is given
+    given["map"] = config.map.model_copy(update={"known": None, "landmarks": ()})  # all of the map is given
     return config.model_copy(update={"robots": robots, **given})
 
 

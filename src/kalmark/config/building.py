@@ -63,12 +63,16 @@ def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
             made = _part(config, (each.name,), getattr(config, each.name), robots[0].motion.space.world)
             kept[each.name] = made
     slam: Slam = _made(config, ("robots",), Slam, robots, **kept, **given)
+    world = robots[0].motion.space.world
     for name, mean, cov, columns in _known(config, log):
-        high = columns == HIGH and robots[0].motion.space.world == "plane"
-        try:
-            slam.add_landmark(name, mean, cov, PointHeight2D() if high else None)
-        except MapError as error:
-            raise config.error(("map", "known"), f"got {m.known!r}, {error}") from None
+        high = PointHeight2D() if columns == HIGH and world == "plane" else None
+        _made(config, ("map", "known"), slam.add_landmark, name, mean, cov, high)
+    for k, known in enumerate(m.landmarks):
+        at = ("map", "landmarks", str(k))
+        model = _part(config, (*at, "landmark"), known.landmark, world)
+        _made(config, at, slam.add_landmark, known.id, known.mean, known.cov, model)
+    if m.cov is not None:
+        _made(config, ("map", "cov"), slam.state.set_covariance, m.cov)
     return slam
 
 
@@ -258,7 +262,7 @@ def _made(config: Config, path: KeyPath, make: Callable[..., Any], *args: Any, *
     """Return what `make` makes of these; errors name the place of the section at `path`."""
     try:
         return make(*args, **keys)
-    except (ModelError, LogError) as error:
+    except (ModelError, LogError, MapError) as error:
         raise config.error(path, str(error)) from None
 
 

@@ -98,6 +98,7 @@ def page() -> str:
         _section(f"{of_sensor}.classes`", section_of("classes", "classes")),
         _choice("`estimator`", "estimator"),
         _section("`map`", schema.MapConfig),
+        _section("`map.landmarks`, each", schema.KnownConfig),
         _section("`picture`", section_of("picture", "picture")),
     ]
     return "\n".join(parts)

@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Discriminator, Field, PrivateAttr, Tag, create_
 from kalmark.config.sections import (
     BASES,
     Choice,
+    LandmarkId,
     Linearity,
     ModelSection,
     RobotName,
@@ -41,6 +42,8 @@ Picture = Annotated[Any, Choice("picture")]
 Plugins = Annotated[KeyPath, Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
 
+Covariance = Annotated[tuple[Numbers, ...], Field(strict=False)]
+
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"
 _PLANE_FOR_SPACE = "a key of the plane for a robot of space"
 POSE_OF_PLANE = ("theta_rad", "sigma_xy_m", "sigma_theta_rad")
@@ -52,7 +55,7 @@ class _Place(Section):
     """Position along x: forward."""
     y_m: Number = 0.0
     """Position along y: to the left."""
-    cov: Annotated[tuple[Numbers, ...], Field(strict=False)] | None = None
+    cov: Covariance | None = None
     """The covariance, row by row, where it is more than sigmas: position, rotation, what a state has behind them."""
 
 
@@ -352,13 +355,30 @@ OF_MAP: Any = options_section(
 )
 
 
+class KnownConfig(Section):
+    """A landmark known beforehand, in the numbers of its type: `Slam.add_landmark`."""
+
+    id: LandmarkId
+    """Its id: a number or a text."""
+    mean: Numbers
+    """Its mean: of a point x, y and, in space, z, of a tag x, y, z, qx, qy, qz, qw."""
+    cov: Covariance | None = None
+    """Covariance of its error, row by row; known exactly if absent."""
+    landmark: Annotated[Any, Choice("landmark")] | None = None
+    """Its type; what the first sensor starts, or a point, if absent."""
+
+
 class MapConfig(OF_MAP):  # type: ignore[misc]
-    """Storage of the covariance."""
+    """Storage of the covariance, and the landmarks known beforehand."""
 
     known: str | None = None
     """Landmarks known: a landmarks.csv or tagslam.yaml, beside this file or in KALMARK_DATA; `truth`: of the log."""
     exact: bool = False
     """Take the landmarks of `known` as exact, without the columns cov_... of the file."""
+    landmarks: Annotated[tuple[KnownConfig, ...], Field(strict=False)] = ()
+    """Landmarks known, of any type, in this file."""
+    cov: Covariance | None = None
+    """Joint covariance of robots, their biases and mounts that are estimated, and the `landmarks` with a `cov`."""
 
 
 def _each() -> dict[str, AnyRobot]:

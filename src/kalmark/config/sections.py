@@ -39,8 +39,8 @@ from kalmark.declare import (
     summary,
     world_of_class,
 )
-from kalmark.errors import ModelError
-from kalmark.events import MOST, is_number
+from kalmark.errors import EventError, ModelError
+from kalmark.events import MOST, Id, checked_id, is_number
 from kalmark.models.protocols import has_second_camera
 from kalmark.plugins import entry_points_of, load
 from kalmark.slam.sources import SearchingDetector
@@ -111,6 +111,16 @@ def _robot(value: Any) -> int | str:
 
 
 RobotName = Annotated[int | str, PlainValidator(_robot)]
+
+
+def _id(value: Any) -> Id:
+    try:
+        return checked_id(value, "id")
+    except EventError as error:
+        raise unexpected_value(str(error).rpartition("expected ")[2]) from None
+
+
+LandmarkId = Annotated[Id, PlainValidator(_id)]
 
 BASES: dict[tuple[str, str], type[Section]] = {}  # by role and world: what all sections of that choice have
 

@@ -221,7 +221,7 @@ def _nearest_landmarks(scan: ScanContext, begun: Set[Id]) -> list[tuple[Observat
     exact = [(model, [known[i] for i in rows]) for model, rows in tracks.known_by_model(channel, known)]
     return [
         *((model, of, scan.map.means(tracks.slots_of(of), model.d)) for model, of in mapped),
-        *((model, of, tracks.known.means(of)) for model, of in exact),
+        *((model, of, tracks.known.means(of, model.d)) for model, of in exact),
     ]
 
 

@@ -20,7 +20,7 @@ from kalmark.results.history import NONE, WHOLE, Biased, CalibratedMount, Camera
 from kalmark.results.landmark_table import LINE
 from kalmark.results.measures import correlations_of
 from kalmark.results.truth import as_rigid
-from kalmark.slam.description import describe
+from kalmark.slam.description import describe, describe_beginning
 from kalmark.slam.held_control import bias_name
 
 if TYPE_CHECKING:
@@ -33,21 +33,21 @@ USED = ("associated", "new")
 KEPT = 40  # landmarks of a map whose correlations are kept
 
 
-def configuration(slam: Slam, log: Log, known: str | None = None) -> dict[str, Any]:
+def configuration(slam: Slam, log: Log) -> dict[str, Any]:
     """Return the configuration that makes the run of a log by a Slam again: its plugins, the log, the filter.
 
-    `known` is the file of the landmarks that were in the map before the first event.
+    Before the first event of the Slam it has what was added to its map.
     """
     said: dict[str, Any] = {}
     parts = (slam.state.settings, *slam.robots.values(), *mounts_of(slam.robots).values())
     models = [each for part in parts for each in vars(part).values()]
+    models += [slam.landmark_model(name) for name in (*slam.tracks.confirmed, *slam.tracks.known)]
     own: list[Any] = [type(each) for each in models if not isinstance(each, np.ndarray | np.generic)]
     if log.path is not None:
         said["log"] = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
         own += [entry.read] if (entry := known_formats().get(log.format)) else []
     plugins = sorted({str(file) for each in own if (file := plugin_of(each)) is not None})
-    described = describe(slam)
-    described["map"] |= {} if known is None else {"known": known}
+    described = describe(slam) if slam.t_ns is not None else describe_beginning(slam)
     return ({"plugins": plugins} if plugins else {}) | said | described
 
 

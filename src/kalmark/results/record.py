@@ -43,7 +43,7 @@ from kalmark.results.history import (
     texts,
 )
 from kalmark.results.landmark_table import MapLandmarks
-from kalmark.results.recording import KNOWN, LogReference
+from kalmark.results.recording import LogReference
 from kalmark.results.repeated_landmarks import repeat_rows
 from kalmark.results.run import Run
 from kalmark.results.truth import Truth
@@ -93,7 +93,7 @@ def record(
     refuse_other_columns(slam, log)
     refuse_other_times(log)
     slam.prepare_for(log.events)
-    recorder, observers = _Recorder(slam, log, pictures), tuple(observers)
+    recorder, observers = _Recorder(slam, log, pictures, config), tuple(observers)
     begin = time.perf_counter()
     with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.expectations:
         for event in track(log.events, log.name or "log", len(log.events), show=progress, note=recorder.rate):
@@ -108,7 +108,7 @@ def record(
             except DivergedError as error:
                 recorder.stopped = str(error)
                 break
-    return recorder.run(config, time.perf_counter() - begin)
+    return recorder.run(time.perf_counter() - begin)
 
 
 class _Compiler(numba_event.Listener):  # type: ignore[misc, unused-ignore]
@@ -155,8 +155,9 @@ def _steps(kinds: set[type]) -> tuple[str, Any]:
 class _Recorder:
     """Gathers one run; `process` is the hot path, everything is put in order afterwards by `run`."""
 
-    def __init__(self, slam: Slam, log: Log, pictures: bool) -> None:
+    def __init__(self, slam: Slam, log: Log, pictures: bool, config: Mapping[str, Any] | None) -> None:
         self.slam, self.log, self.pictures = slam, log, pictures
+        self.config = configuration(slam, log) if config is None else dict(config)
         kinds = {type(event) for event in log.events}
         self.has_images = Frame in kinds
         self.stepped_by, self.stepped = _steps(kinds)
@@ -174,7 +175,6 @@ class _Recorder:
         )
         surveyed = slam.landmarks() if slam.t_ns is None else ()  # in a map that is resumed they are correlated
         self.priors = tuple(Prior(str(l.id), np.array(l.mean), np.array(l.covariance)) for l in surveyed)
-        self.known = MapLandmarks.of(slam).to_csv() if len(surveyed) else ""
         self.controls: dict[str, Controlled] = {}
         self.reckoned = {name: DeadReckoning(robot) for name, robot in slam.robots.items()}
         self.dead: list[Array] = []
@@ -260,7 +260,7 @@ class _Recorder:
         correlations = correlations_kept(self.slam, when[-1])
         return MapSnapshot(*when, *landmarks.places(), kinds, of_shape, robots, correlations)
 
-    def run(self, config: Mapping[str, Any] | None, wall_s: float) -> Run:
+    def run(self, wall_s: float) -> Run:
         """Return the run made of what was gathered."""
         log, slam = self.log, self.slam
         if self.reports and (not self.maps or self.maps[-1].step < len(self.reports) - 1):
@@ -268,7 +268,7 @@ class _Recorder:
         history = self._history()
         return Run(
             history=history,
-            config=dict(config) if config is not None else configuration(slam, log, KNOWN if self.known else None),
+            config=self.config,
             landmarks=MapLandmarks.of(slam),
             truth=Truth.of(log, history, self.anchored),
             log=LogReference(log.name, log.format, None if log.path is None else str(log.path), tuple(log.robots)),
@@ -279,7 +279,6 @@ class _Recorder:
             slam=slam,
             source=log,
             reference=plain_value(log.reference),
-            known="" if config is not None else self.known,
         )
 
     def _history(self) -> History:

@@ -44,7 +44,6 @@ CHANGES = ("t_s", "robot", "landmark", "change", "into", "reason")
 FAST, PAYS = 1, 0.75  # the level of compression of ``history.npz``, and what it must leave at most to be used
 LONGEST_NAME = 100  # bytes of a robot or a sensor in the name of a file, which has 255 at most
 NEEDED = ("summary.json", "config.yaml", "history.npz", "landmarks.csv")
-KNOWN = "known.csv"
 
 
 def tum(history: History, robot: str) -> str:
@@ -141,8 +140,7 @@ class Recording:
     `summary` is what `Run.evaluate` last returned.  `slam`, the filter after the last event, and `source`, the log
     itself, are None in a run that was loaded; `final_slam` reads the filter from ``map.kmk``.  `reference` holds what
     others made of the same log, figures by their name, which the summary repeats.  Plug-ins of the
-    configuration are run only if the run is `trusted`.  `known` is the text of ``known.csv``: the landmarks that were
-    in the map before the first event and are in no other file.
+    configuration are run only if the run is `trusted`.
     """
 
     history: History
@@ -160,7 +158,6 @@ class Recording:
     summary: Figures = field(default_factory=dict)
     reference: Figures = field(default_factory=dict)
     trusted: bool = True
-    known: str = ""
 
     def __repr__(self) -> str:
         steps, lost = len(self.history.t_ns), f", stopped: {self.stopped}" if self.stopped else ""
@@ -251,7 +248,6 @@ class Recording:
                     stopped=summary.get("stopped", ""),
                     folder=folder,
                     trusted=trust,
-                    known=(folder / KNOWN).read_text(encoding="utf-8") if (folder / KNOWN).is_file() else "",
                     summary=summary,
                     reference={name: summary[name] for name in named["reference"].tolist()},
                 )
@@ -264,8 +260,6 @@ class Recording:
             write(folder / f"trajectory_{file_name(robot)}.tum", tum(self.history, robot))
         write(folder / "config.yaml", config_yaml(self.config))
         write(folder / "landmarks.csv", self.landmarks.to_csv())
-        if self.known:
-            write(folder / KNOWN, self.known)
         write(folder / "associations.csv", associations_csv(self.history))
         if self.history.changes:
             write(folder / "changes.csv", changes_csv(self.history))

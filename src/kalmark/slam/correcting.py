@@ -82,7 +82,7 @@ def correct_by_known(state: State, scan: ScanContext, policy: Policy, decisions:
     judged = []
     for model, rows in groups:
         names: list[Any] = [decisions[k][0] for k in rows]
-        l, estimator = known.means(names), state.estimator.for_fixes()
+        l, estimator = known.means(names, model.d), state.estimator.for_fixes()
         approach = partial(_approach, state, scan, model.exactly, np.full(len(rows), scan.robot), rows, l)
         approach(range(len(rows)), least)
         done = surveyed_corrections.correct_by_surveys(

@@ -16,6 +16,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import declared_options, has_one_model, own_name, parameters, registered_name
+from kalmark.events import Id
 from kalmark.geometry.named_poses import describe_pose, pose_of, world_of
 from kalmark.models.landmark_views import Raised
 from kalmark.models.protocols import state_columns
@@ -48,6 +49,34 @@ def describe(slam: Estimate) -> Description:
     linear = out.pop("reparametrize")
     kept = {"type": out.pop("map"), "numbers": out.pop("numbers"), "reparametrize": "off" if linear is None else linear}
     return {"robots": {name: _robot(robot) for name, robot in slam.robots.items()}, **out, "map": kept}
+
+
+def describe_beginning(slam: Estimate) -> Description:
+    """Return `describe` of a Slam before its first event, with what was added to its map: the `landmarks` of `map`.
+
+    They are as `Slam.add_landmark` takes them, those known exactly last.  `cov` of `map` is the covariance of all that
+    is in it, if they are correlated: `Slam.fuse`.
+    """
+    out, tracks, found, end = describe(slam), slam.tracks, list[Description](), 0
+    P = slam.covariance(*tracks.slots)
+    alone = np.zeros_like(P)
+    for name, slot in tracks.slots.items():
+        begin, end = end, end + len(slam.map.rows(slot))
+        own = alone[begin:end, begin:end] = P[begin:end, begin:end]
+        if name in tracks.confirmed:
+            found.append(_landmark(slam, name) | {"cov": own.tolist()})
+        elif (robot := slam.robots.get(str(name))) is not None:
+            cov = own if own.any() else robot.cov
+            at = slam.mean(name), robot.motion.space.world, cov, state_columns(robot.motion)
+            out["robots"][name]["start"] = describe_place(*at)
+    found += [_landmark(slam, name) for name in tracks.known]
+    said = {"landmarks": found} if found else {}
+    out["map"] |= said if np.array_equal(P, alone) else said | {"cov": P.tolist()}
+    return out
+
+
+def _landmark(slam: Estimate, name: Id) -> Description:
+    return {"id": name, "landmark": describe_model(slam.landmark_model(name)), "mean": slam.mean(name).tolist()}
 
 
 def plain_value(value: Any) -> Any:

@@ -40,9 +40,10 @@ from kalmark.events import (
     label_of_event,
     list_names,
     seconds_text,
+    unit_quaternion,
 )
 from kalmark.filter.estimators import CompilingEstimator, Estimator, Invariant
-from kalmark.geometry.spaces import RHO
+from kalmark.geometry.spaces import RHO, ROTATION
 from kalmark.management import reparametrize as points
 from kalmark.management.attention import reasons_against_start
 from kalmark.management.upkeep import Upkeep
@@ -420,6 +421,9 @@ class Slam(Estimate):
             what = "names a robot's bias or mount" if name in state.inner else "is in the map already"
             raise MapError(f"landmark {name!r} {what}, expected a new id")
         mean = checked_numbers(mean, model.space.size, f"landmark {name!r}: mean", MapError)
+        for kind, at, _ in model.space.atoms:
+            if kind == ROTATION:
+                mean[at : at + 4] = unit_quaternion(mean[at : at + 4], MapError, f"landmark {name!r}: ")
         if cov is not None:
             cov = check_covariance(cov, model.space.dof, f"landmark {name!r}: cov", definite=False, error=MapError)
         state.settle()

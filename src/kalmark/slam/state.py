@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from kalmark.filter.maps import MOST, CostBalance, compress_map, new_map
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.protocols import Landmark, OfState, world_of
-from kalmark.slam.checks import fault_of, instance, refuse_odd_association, require_methods
+from kalmark.slam.checks import check_covariance, fault_of, instance, refuse_odd_association, require_methods
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
@@ -280,6 +280,14 @@ class State:
             return False
         given.repeats, given.since_ns = given.repeats + 1, given.since_ns if given.repeats else t_ns
         return True
+
+    def set_covariance(self, cov: Any) -> None:
+        """Give all that is in the map, in the order of its names, a joint covariance (n, n).  Raises MapError."""
+        slots = [*self.tracks.slots.values()]
+        P = self.map.covariance(slots)
+        cov = check_covariance(cov, len(P), "cov of all that is in the map", definite=False, error=MapError)
+        parts = tuple((slot, len(self.map.rows(slot))) for slot in slots)
+        self.map.predict(self.rows(parts), np.eye(len(P)), cov - P)
 
     def is_surveyed(self, name: Id) -> bool:
         """Return whether a landmark was given, and not mapped from here."""

@@ -69,7 +69,7 @@ def expectations(
             found.append((rows[some], linearize_blocks(map_, channel, slot, model, slots[some], seen.y[some])))
     for model, group in tracks.known_by_model(channel, names):
         rows, known = np.array(group), [names[i] for i in group]
-        l = tracks.known.means(known)
+        l = tracks.known.means(known, model.d)
         extents = [tracks.known.extent(name) for name in known]
         seen = visible_landmarks(channel, model, channel.pose(map_, slot), l, extents, reasons=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):

@@ -194,9 +194,9 @@ class KnownLandmarks:
         kind, row = self._at[name]
         return self.of_kind[kind].values[row].copy()
 
-    def means(self, names: Iterable[Id]) -> Array:
-        """Return the numbers (K, n) of landmarks of one kind."""
-        return np.array([self.mean(name) for name in names])
+    def means(self, names: Iterable[Id], d: int) -> Array:
+        """Return the first d numbers (K, d) of landmarks, which may be of several kinds."""
+        return np.array([self.mean(name)[:d] for name in names])
 
     def observations(self, name: Id) -> int:
         """Return how many observations of a landmark were used."""

@@ -119,7 +119,7 @@ class Prospect:
         """Enter the names in view; return their slots (k,) and, of landmarks known exactly, where they are (k, n)."""
         exactly = names[0] in tracks.known
         slots = np.zeros(len(names), np.int64) if exactly else tracks.slots_of(names)
-        l = tracks.known.means(names) if exactly else map_.means(slots, model.d)
+        l = tracks.known.means(names, model.d) if exactly else map_.means(slots, model.d)
         seen = np.flatnonzero(self.sensor.sees(landmarks_in_frame(model.landmark, self.T, l)))
         self.names += [names[i] for i in seen.tolist()]
         return slots[seen], l[seen] if exactly else None
