@@ -464,7 +464,7 @@ def registered_name(model: type) -> str | None:
 
 
 def own_name(model: type) -> str:
-    """Return how a user's class that has no name is called: file.py:Class, or module:Class without a file."""
+    """Return how a user's class or function without a name is called: file.py:Class, or module:Class without a file."""
     file = _file_of(sys.modules.get(model.__module__))
     return f"{model.__module__ if file is None else file.name}:{model.__qualname__}"
 

@@ -33,6 +33,11 @@ ROLES = (
     *("motion", "sensor", "landmark", "association", "estimator"),
     *("detector", "initialization", "attention", "upkeep", "classes"),
 )
+WORLDS: dict[str, tuple[Any, Any]] = {
+    "plane": (km.motion.Unicycle(), (0, 0, 0)),
+    "space": (km.motion.Odometry3D(), (0, 0, 0, 0, 0, 0, 1)),
+}
+"""A motion of each world, and a mount at the origin."""
 MODELS = [(role, each) for role in ROLES for each in built_in(role)]
 KINDS = (km.Robot, km.Mount, Settings)
 OPTIONS = [(kind, option.name) for kind in KINDS for option in declared_options(kind) if option.role != "motion"]
@@ -246,6 +251,102 @@ def test_options_of_a_log_are_in_the_configuration_of_the_run(tmp_path: Path) ->
     assert_same_state(again, slam)
 
 
+def write_drive(folder: Path, motion: Any, robots: dict[str, Any], ids: tuple[str, ...]) -> None:
+    """Write a log of robots with one control, whose sensor "s" sees the first landmark, and the others later on."""
+    controls, scans = [",".join(("t_s,robot", *motion.columns))], list[str]()
+    for k, (name, sensor) in itertools.product(range(8), robots.items()):
+        controls.append(f"{0.1 * k:.1f},{name}{',0.1' * len(motion.columns)}")
+        y = ",".join(("2.5", "0.3", "0.2")[: len(sensor.columns)])
+        scans = scans or [",".join(("t_s,robot,sensor,id", *sensor.columns))]
+        scans += [f"{0.1 * k:.1f},{name},s,{id_},{y}" for id_ in ids[: 1 + (k > 3)]]
+    folder.mkdir()
+    for table, rows in (("controls", controls), ("scans", scans)):
+        (folder / f"{table}.csv").write_text("\n".join(rows) + "\n")
+
+
+PARTS = ("landmark", "association", "detector", "initialization", "attention", "upkeep", "classes")  # of a mount
+
+
+def robots_with(role: str, kind: Any, world: str) -> Iterator[km.Robot]:
+    """Yield, for each parameter of a model, a robot of a world that has a model with another value of it."""
+    moves, at = WORLDS[world]
+    for own in parameters(kind):
+        made, name = changed(kind, own.name), f"{role}.{kind.__name__}.{own.name}"
+        if role == "motion":
+            yield km.Robot(name, made)
+        sensors = [made] if role == "sensor" else [each() for each in built_in("sensor") if role in PARTS]
+        for sensor in sensors:
+            part = {role: made} if role in PARTS else {}
+            try:
+                robot = km.Robot(name, moves, sensors={"s": km.Mount(sensor, at, **part)})
+                km.Slam([robot])
+            except (KalmarkError, TypeError):
+                continue
+            yield robot
+            break
+
+
+@pytest.mark.parametrize("world", ["plane", "space"])
+def test_a_run_with_every_parameter_of_every_model_is_the_same_from_its_folder(world: str, tmp_path: Path) -> None:
+    motion, at = WORLDS[world]
+    sensor = class_of("sensor", {"plane": "range_bearing", "space": "range_bearing_3d"}[world])()
+    models = [(role, kind) for role, kind in MODELS if world_of_class(kind) in (world, "")]
+    robots = [robot for role, kind in models for robot in robots_with(role, kind, world)]
+    had = {robot.name.rpartition(".")[0] for robot in robots}
+    lacking = {f"{role}.{kind.__name__}" for role, kind in models if parameters(kind)} - had
+    assert all(name.startswith(("estimator", "detector")) for name in lacking)  # these are of the other world
+    seen = {"first": sensor, "last": sensor}
+    mounted = [km.Robot(name, motion, sensors={"s": km.Mount(sensor, at)}) for name in seen]
+    slam = km.Slam([mounted[0], *robots, mounted[1]], estimator=changed(km.estimators.Invariant, "iterations"))
+    write_drive(tmp_path / "log", motion, {"last": sensor, "first": sensor}, ("a", "b"))
+    run = km.record(slam, km.open_log(tmp_path / "log"), progress=False, pictures=False)
+    assert run.notes == []
+    run.save(tmp_path / "run")
+    again, log = run_again(tmp_path / "run")
+    assert_same(again, slam)
+    assert_same_state(km.record(again, log, progress=False, pictures=False).slam, slam)
+
+
+# ---------------------------------------------------------------------- the configuration lacks something
+def test_a_robot_without_events_is_in_the_run_again_in_its_place(tmp_path: Path) -> None:
+    sensor = km.sensors.RangeBearing()
+    robots = [km.Robot(name, km.motion.Unicycle(), sensors={"s": km.Mount(sensor)}) for name in ("parked", "rover")]
+    robots[0] = replace(robots[0], start=(2.0, 1.0, 0.5), cov=random_covariance(3))
+    write_drive(tmp_path / "log", km.motion.Unicycle(), {"rover": sensor}, ("a", "parked"))
+    slam = km.Slam(robots)
+    run = km.record(slam, km.open_log(tmp_path / "log"), progress=False, pictures=False)
+    assert run.config["log"]["without_events"] == ["parked"]
+    assert slam.covariance("rover", "parked")[:3, 3:].any()  # it was observed
+    run.save(tmp_path / "run")
+    assert_same_state(km.record(*run_again(tmp_path / "run"), progress=False, pictures=False).slam, slam)
+
+
+def find(scan: km.Scan) -> km.Scan:
+    return scan
+
+
+def test_a_run_notes_what_its_configuration_lacks(tmp_path: Path) -> None:
+    rover = km.Robot("r", km.motion.Unicycle(), sensors={"s": km.Mount(SENSORS[0], detector=find)})
+    slam, events = km.Slam([rover]), [km.Control(t_s=0.1 * k, robot="r", u=(0.5, 0.1)) for k in range(4)]
+    slam.process(events[0])
+    run = km.record(slam, events[1:], progress=False)
+    assert run.notes == [
+        "config.yaml has no log, because this one has no file: `kalmark run` of it requires --log",
+        "config.yaml lacks the events that the filter had before this log: `kalmark run` makes another map",
+        f"config.yaml cannot have {Path(__file__).name}:find: `kalmark run` requires a registered class in a file",
+    ]
+    run.save(tmp_path / "run")
+    assert km.Run.load(tmp_path / "run").evaluate()["notes"][:3] == run.notes
+    with pytest.raises(ConfigError, match=r"detector\.type: got '.*:find', expected one of"):
+        load_config(tmp_path / "run" / "config.yaml")
+
+
+def test_a_detector_of_what_its_sensor_does_not_measure_is_refused() -> None:
+    said = r"Mount: detector is a Walls, expected one for the bearing_rad of a Bearing"
+    with pytest.raises(ModelError, match=said):
+        km.Mount(km.sensors.Bearing(), detector=km.detect.Walls())
+
+
 # ---------------------------------------------------------------------- landmarks known beforehand
 def run_again(folder: Path) -> tuple[km.Slam, km.Log]:
     """Return the filter and the log that `kalmark run` makes of the configuration in a run folder."""
@@ -277,7 +378,7 @@ def add_to(slam: km.Slam, model: Any, name: Any) -> None:
 
 @pytest.mark.parametrize("kind", built_in("landmark"), ids=[kind.__name__ for kind in built_in("landmark")])
 def test_landmarks_of_every_type_are_read_again_with_all_parameters(kind: Any, tmp_path: Path) -> None:
-    moves = {"plane": km.motion.Unicycle(), "space": km.motion.Odometry3D()}[world_of_class(kind)]
+    moves, _ = WORLDS[world_of_class(kind)]
     slam = km.Slam([km.Robot("r", moves, cov=random_covariance(moves.space.dof))])
     for n, model in enumerate([kind(), *(changed(kind, own.name) for own in parameters(kind))]):
         add_to(slam, model, n)
@@ -360,21 +461,13 @@ def test_a_run_with_landmarks_of_every_type_is_the_same_map_by_the_command_line(
 ) -> None:
     monkeypatch.setattr("kalmark.compiled.say_compiling", lambda: None)
     monkeypatch.setattr("kalmark.cli.run.judge", lambda run: None)
-    motion, sensor, at = {
-        "plane": (km.motion.Unicycle(), km.sensors.RangeBearing(), (0, 0, 0)),
-        "space": (km.motion.Odometry3D(), km.sensors.RangeBearing3D(), (0, 0, 0, 0, 0, 0, 1)),
-    }[world]
+    motion, at = WORLDS[world]
+    sensor = class_of("sensor", {"plane": "range_bearing", "space": "range_bearing_3d"}[world])()
     slam = km.Slam([km.Robot("r", motion, None, {"s": km.Mount(sensor, at)})])
     for kind in built_in("landmark"):
         if world_of_class(kind) == world:
             add_to(slam, kind(), kind.__name__)
-    u, y = ",0.1" * len(motion.columns), ",2.5,0.3,0.2"[: 4 * len(sensor.columns)]
-    (tmp_path / "log").mkdir()
-    rows = [",".join(("t_s,robot", *motion.columns)), *(f"{0.1 * k:.1f},r{u}" for k in range(8))]
-    (tmp_path / "log" / "controls.csv").write_text("\n".join(rows) + "\n")
-    seen = [f"{0.1 * k:.1f},r,s,{name}{y}" for k in range(8) for name in ("new", "Point2D" if u else "")[: 1 + (k > 3)]]
-    rows = [",".join(("t_s,robot,sensor,id", *sensor.columns)), *seen]
-    (tmp_path / "log" / "scans.csv").write_text("\n".join(rows) + "\n")
+    write_drive(tmp_path / "log", motion, {"r": sensor}, ("new", "Point2D" if world == "plane" else "Point3D"))
     km.record(slam, km.open_log(tmp_path / "log"), progress=False).save(tmp_path / "run")
     assert main(["run", str(tmp_path / "run" / "config.yaml"), "--out", str(tmp_path / "again")]) == 0
     assert_same_state(km.Slam.load(tmp_path / "again" / "map.kmk"), km.Slam.load(tmp_path / "run" / "map.kmk"))

@@ -183,11 +183,12 @@ def _names(config: Config, log: Log | None) -> list[str]:
     named = [name for name in config.robots if name != EACH]
     if log is None:
         return named or ["robot"]
+    there = (*log.robots, *config.log.without_events)
     for name in named if config.log.robots is None else ():
-        if name not in log.robots:
+        if name not in there:
             what = "got a robot that the log does not have"
             raise config.error(("robots", name), f"{what}, {one_near(log.robots, name)}")
-    return list(log.robots)
+    return [*dict.fromkeys(name for name in (*named, *there) if name in there)]
 
 
 def _start(

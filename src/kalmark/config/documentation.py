@@ -36,7 +36,8 @@ among the `plugins`: a path beside the configuration.  **This runs the code of t
 is read: name only files that you trust.  A class without a name is named by its file, `mine:Class`.
 A section that is a `type` alone may be written as that: `estimator: ekf`.
 The `config.yaml` that a run leaves in its folder holds everything that was in force, and can be run again;
-its title is then the folder's name.
+its title is then the folder's name.  The notes of a run recorded in Python state
+everything that its `config.yaml` lacks, as a log without a file.
 `kalmark config native > mine.yaml` prints a shipped one to start from.
 
 ```yaml

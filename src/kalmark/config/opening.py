@@ -122,7 +122,7 @@ def open_config_log(config: Config, log_path: str | Path | None = None, *, progr
     """
     path, options = find_log(config, log_path), resolve_options(config)
     check_format(config, path)
-    common = config.log.model_dump(include={*LogConfig.model_fields} - {"path"})
+    common = config.log.model_dump(include={*LogConfig.model_fields} - {"path", "without_events"})
     common |= {name: resolve_path(config, common[name]) for name in ("truth", "fixes")}
     found = open_log(path, **common, **options, progress=progress)
     if not found.events:

@@ -275,6 +275,9 @@ class LogConfig(OF_LOG):  # type: ignore[misc]
 
     model_config = ConfigDict(extra="allow")
 
+    without_events: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    """Robots of `robots` of which the log has no events."""
+
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_keys(cls, value: Any) -> Any:

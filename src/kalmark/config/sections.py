@@ -30,7 +30,6 @@ from kalmark.declare import (
     classes,
     classes_of,
     has_one_model,
-    is_own,
     load_plugin,
     missing_models,
     parameters,
@@ -41,9 +40,8 @@ from kalmark.declare import (
 )
 from kalmark.errors import EventError, ModelError
 from kalmark.events import MOST, Id, checked_id, is_number
-from kalmark.models.protocols import has_second_camera
 from kalmark.plugins import entry_points_of, load
-from kalmark.slam.sources import SearchingDetector
+from kalmark.slam.sources import finds
 
 FAR = MOST["m"]
 USUAL = {
@@ -213,17 +211,6 @@ class OneOf(Choice):
         """Return the section of a mapping."""
         section: type[Section] = self.sections.get(name) or load(self.group, name)
         return section.model_validate(value)
-
-
-def finds(detector: Any, sensor: Any) -> bool:
-    """Return whether a detector's class may find what a sensor's measures: if both are kalmark's, by their columns.
-
-    One that searches images takes the left one of a pair, too.
-    """
-    if not (is_own(detector) and is_own(sensor)):
-        return True
-    pair = issubclass(detector, SearchingDetector) and has_second_camera(sensor)
-    return bool(pair or detector.columns[:2] == sensor.columns[:2])
 
 
 def section_of(role: str, name: str, world: str = "") -> type[Section]:

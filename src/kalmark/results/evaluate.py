@@ -97,7 +97,7 @@ def evaluate(run: Recording) -> Figures:
     summary = none_for_nan(summary)
     summary["warnings"] = warnings(run, summary)
     summary["advice"] = advice(run, summary)
-    summary["notes"] = [*gap_notes(summary["gaps"]), *repeat_notes(history), *scale_notes(run, robots)]
+    summary["notes"] = [*run.notes, *gap_notes(summary["gaps"]), *repeat_notes(history), *scale_notes(run, robots)]
     return summary
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.declare import plugin_of
+from kalmark.declare import declared_options, is_own, own_name, plugin_of
 from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
@@ -38,17 +39,37 @@ def configuration(slam: Slam, log: Log) -> dict[str, Any]:
 
     Before the first event of the Slam it has what was added to its map.
     """
-    said: dict[str, Any] = {}
-    parts = (slam.state.settings, *slam.robots.values(), *mounts_of(slam.robots).values())
-    models = [each for part in parts for each in vars(part).values()]
-    models += [slam.landmark_model(name) for name in (*slam.tracks.confirmed, *slam.tracks.known)]
-    own: list[Any] = [type(each) for each in models if not isinstance(each, np.ndarray | np.generic)]
+    own, of_log = _own(slam), dict[str, Any]()
     if log.path is not None:
-        said["log"] = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
+        of_log = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
         own += [entry.read] if (entry := known_formats().get(log.format)) else []
+    if silent := [name for name in slam.robots if name not in log.robots]:
+        of_log["without_events"] = silent
     plugins = sorted({str(file) for each in own if (file := plugin_of(each)) is not None})
-    described = describe(slam) if slam.t_ns is not None else describe_beginning(slam)
-    return ({"plugins": plugins} if plugins else {}) | said | described
+    said = ({"plugins": plugins} if plugins else {}) | ({"log": of_log} if of_log else {})
+    return said | (describe(slam) if slam.t_ns is not None else describe_beginning(slam))
+
+
+def not_described(slam: Slam, log: Log) -> Iterator[str]:
+    """Yield a line for each thing that a run of a log by a Slam has and its configuration has not."""
+    if log.path is None:
+        yield "config.yaml has no log, because this one has no file: `kalmark run` of it requires --log"
+    if slam.t_ns is not None:
+        yield "config.yaml lacks the events that the filter had before this log: `kalmark run` makes another map"
+    for kind in _own(slam):
+        if not is_own(kind) and (isinstance(kind, FunctionType) or plugin_of(kind) is None):
+            yield f"config.yaml cannot have {own_name(kind)}: `kalmark run` requires a registered class in a file"
+
+
+def _own(slam: Slam) -> list[Any]:
+    """Return the classes, or functions, of the models of a Slam."""
+    mounts = mounts_of(slam.robots).values()
+    parts = (slam.state.settings, *slam.robots.values(), *mounts)
+    models = [vars(part)[own.name] for part in parts for own in declared_options(type(part))]
+    models += [mount.sensor for mount in mounts]
+    models += [slam.landmark_model(name) for name in (*slam.tracks.confirmed, *slam.tracks.known)]
+    models = [each for each in models if not isinstance(each, bool | int | float | str | np.generic | None)]
+    return [*dict.fromkeys(each if isinstance(each, FunctionType) else type(each) for each in models)]
 
 
 @runtime_checkable

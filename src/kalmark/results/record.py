@@ -25,6 +25,7 @@ from kalmark.results.filter_description import (
     cameras,
     configuration,
     correlations_kept,
+    not_described,
     residual_px,
     sensors,
     stated_noise,
@@ -158,6 +159,7 @@ class _Recorder:
     def __init__(self, slam: Slam, log: Log, pictures: bool, config: Mapping[str, Any] | None) -> None:
         self.slam, self.log, self.pictures = slam, log, pictures
         self.config = configuration(slam, log) if config is None else dict(config)
+        self.notes = [*not_described(slam, log)] if config is None else []
         kinds = {type(event) for event in log.events}
         self.has_images = Frame in kinds
         self.stepped_by, self.stepped = _steps(kinds)
@@ -269,6 +271,7 @@ class _Recorder:
         return Run(
             history=history,
             config=self.config,
+            notes=self.notes,
             landmarks=MapLandmarks.of(slam),
             truth=Truth.of(log, history, self.anchored),
             log=LogReference(log.name, log.format, None if log.path is None else str(log.path), tuple(log.robots)),

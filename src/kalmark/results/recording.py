@@ -139,7 +139,8 @@ class Recording:
 
     `summary` is what `Run.evaluate` last returned.  `slam`, the filter after the last event, and `source`, the log
     itself, are None in a run that was loaded; `final_slam` reads the filter from ``map.kmk``.  `reference` holds what
-    others made of the same log, figures by their name, which the summary repeats.  Plug-ins of the
+    others made of the same log, figures by their name, which the summary repeats.  `notes` are
+    those about the configuration, which the summary has, too.  Plug-ins of the
     configuration are run only if the run is `trusted`.
     """
 
@@ -151,6 +152,7 @@ class Recording:
     coordinates: str = "world"
     wall_s: float = 0.0
     skipped: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     stopped: str = ""
     slam: Slam | None = None
     source: Log | None = None
@@ -245,6 +247,7 @@ class Recording:
                         line if n == 1 else LeftOut(line, n)
                         for line, n in zip(named["skipped"].tolist(), named["skipped_records"].tolist(), strict=True)
                     ],
+                    notes=named["notes"].tolist() if "notes" in named else [],
                     stopped=summary.get("stopped", ""),
                     folder=folder,
                     trusted=trust,
@@ -273,6 +276,7 @@ class Recording:
     def _save_arrays(self, path: Path) -> None:
         arrays: dict[str, Any] = {**self.history.arrays(), **self.truth.arrays()}
         arrays["skipped"] = np.array(self.skipped, dtype=np.str_)
+        arrays["notes"] = np.array(self.notes, dtype=np.str_)
         arrays["skipped_records"] = ints([records_of(line) for line in self.skipped])
         arrays["reference"] = np.array(list(self.reference), dtype=np.str_)
         _savez(path, arrays)

@@ -345,7 +345,7 @@ def _images(run: Recording, _: Summary) -> Iterator[str]:
     for camera in history.cameras:
         mine = history.made_by(camera.robot, camera.sensor)
         outside = np.zeros(int(mine.sum()), dtype=np.bool_)
-        for k, name in enumerate(camera.columns):
+        for k, name in enumerate(camera.columns[: history.y.shape[1]]):
             if name.endswith("_px"):
                 limit = camera.size[0 if name.startswith("u") else 1]
                 outside |= (history.y[mine, k] < -MARGIN * limit) | (history.y[mine, k] > (1 + MARGIN) * limit)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -91,8 +92,9 @@ def plain_value(value: Any) -> Any:
 
 
 def describe_model(value: Any) -> Description:
-    """Return the type and the parameters of a model; a class without a name in configurations is file.py:Class."""
-    name = registered_name(type(value)) or own_name(type(value))
+    """Return the type and the parameters of a model; a class or function without a name is file.py:Class."""
+    kind: Any = value if isinstance(value, FunctionType) else type(value)
+    name = registered_name(kind) or own_name(kind)
     given = {own.name: plain_value(vars(value)[own.name]) for own in parameters(type(value))}
     return given if has_one_model(name) else {"type": name} | given
 

@@ -33,7 +33,7 @@ from kalmark.models.protocols import (
 )
 from kalmark.slam.checks import check_covariance, instance, refuse_odd_association, require_methods
 from kalmark.slam.gaps import Gaps
-from kalmark.slam.sources import SearchingDetector
+from kalmark.slam.sources import SearchingDetector, finds
 from kalmark.tracks.classes import Classes
 
 INFINITE = math.inf
@@ -128,9 +128,7 @@ class Mount:
         if self.association is not None:
             refuse_odd_association(self.association, "Mount: association")
         if self.detector is not None:
-            searches = isinstance(self.detector, SearchingDetector)
-            one = "an object like km.detect.Trunks(), or a function"
-            require_methods(self.detector, ("source" if searches else "__call__",), "Mount: detector", one)
+            self._refuse_odd_detector()
             declared = {own.name for own in parameters(type(self.detector))}
             if "signature" in declared and vars(self.detector)["signature"] is None:
                 chosen: Any = replace(self.detector, signature="signature" in self.sensor.columns)  # type: ignore[type-var]
@@ -153,6 +151,15 @@ class Mount:
         if self.lags and isinstance(self.sensor, OfState | SeesVelocity):
             raise ModelError(f"Mount: lag_s is {self.lag_s:g}, {of_robot} 0 and no sigma")
         object.__setattr__(self, "at", _pose(self.at, "Mount: at", (3, 7)))
+
+    def _refuse_odd_detector(self) -> None:
+        searches = isinstance(self.detector, SearchingDetector)
+        one = "an object like km.detect.Trunks(), or a function"
+        require_methods(self.detector, ("source" if searches else "__call__",), "Mount: detector", one)
+        found, sensor = type(self.detector), type(self.sensor)
+        if not finds(found, sensor):
+            one = f"one for the {', '.join(self.sensor.columns)} of a {sensor.__name__}"
+            raise ModelError(f"Mount: detector is a {found.__name__}, expected {one}")
 
     @property
     def lags(self) -> bool:

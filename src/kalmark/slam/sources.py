@@ -10,8 +10,10 @@ from collections.abc import Set
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from kalmark.arrays import Array
+from kalmark.declare import is_own
 from kalmark.events import Id, Raw, Scan
 from kalmark.filter.map import Map
+from kalmark.models.protocols import has_second_camera
 from kalmark.report import Report
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.track import Tracks
@@ -114,3 +116,14 @@ class SearchingDetector(Protocol):
     def source(self, sensor: Any) -> Source:
         """Return the source of the scans of a sensor."""
         ...
+
+
+def finds(detector: Any, sensor: Any) -> bool:
+    """Return whether a detector's class may find what a sensor's measures: if both are kalmark's, by their columns.
+
+    One that searches images takes the left one of a pair, too.
+    """
+    if not (is_own(detector) and is_own(sensor)):
+        return True
+    pair = issubclass(detector, SearchingDetector) and has_second_camera(sensor)
+    return bool(pair or detector.columns[:2] == sensor.columns[:2])
