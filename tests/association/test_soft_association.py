@@ -10,7 +10,6 @@ import numpy as np
 from kalmark.association.averaging import average, outcomes
 from kalmark.association.posterior import Posterior
 from kalmark.association.protocol import NEW, Decision, Mixture
-from kalmark.association.wall_segments import gap
 
 SLOTS = {"a": 4, "b": 5, "c": 9}
 
@@ -64,8 +63,3 @@ def test_an_observation_is_reported_with_its_shares_the_likeliest_first() -> Non
     assert first.reason == "averaged: 'a' 0.70, 'c' 0.30"
     assert (second.index, second.landmark, second.d2) == (2, "c", None)
     np.testing.assert_allclose([share for _, share in second.shares], [0.6 / 0.9995, 0.3 / 0.9995])
-
-
-def test_the_gap_between_two_parts_of_a_line_is_negative_where_they_overlap() -> None:
-    one, other = np.array([[0.0, 1.0], [3.0, 4.0], [0.0, 2.0]]), np.array([[3.0, 4.0], [0.0, 1.0], [1.0, 5.0]])
-    np.testing.assert_array_equal(gap(one, other), [2.0, 2.0, -1.0])

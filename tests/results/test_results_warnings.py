@@ -202,7 +202,7 @@ def test_advice_is_kept_with_a_run_and_shown_in_its_report(tmp_path: Path) -> No
     assert f'<ul class="warnings verdict {verdict.map}"><li>the map is {verdict.map}' in page
     assert "its sigma is stated" in only(run.summary["advice"])
     assert Run.load(tmp_path).evaluate()["advice"] == run.summary["advice"]
-    assert '<ul class="warnings advice">' in page and '<li>sensor lidar: ' in page
+    assert '<ul class="warnings advice">' in page and "<li>sensor lidar: " in page
 
 
 def test_a_filter_that_stopped_says_so_first_and_the_report_shows_it(

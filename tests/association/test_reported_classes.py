@@ -12,7 +12,6 @@ import pytest
 import kalmark as km
 from kalmark.errors import EventError, ModelError
 from kalmark.logs import open_log, write_native
-from kalmark.tracks.classes import add_report, distance_of_landmarks
 
 CONES = km.Classes(("blue", "yellow"), error=0.02)
 ASSOCIATIONS = [
@@ -74,32 +73,6 @@ def test_the_classes_of_a_landmark_follow_the_reports_by_bayes_rule() -> None:
         )
     assert slam.classes("left")["yellow"] == pytest.approx(0.98)
     assert slam.classes("right")["yellow"] > 0.99
-
-
-def test_a_confusion_matrix_says_which_class_is_taken_for_which() -> None:
-    three = km.Classes(("blue", "yellow", "orange"), confusion=(0.9, 0.05, 0.05, 0.05, 0.75, 0.2, 0.1, 0.3, 0.6))
-    np.testing.assert_allclose(three.confusion_matrix[1], [0.05, 0.75, 0.2])
-    known: dict[str, float] = {}
-    add_report(known, three, "orange")
-    assert three.probabilities(known)[2] == pytest.approx(0.6 / 0.85)
-    pairs, new = three.distances(["blue"], [known, {}])
-    assert pairs[0, 0] > pairs[0, 1] == pytest.approx(new[0])
-    assert distance_of_landmarks({"blue": 0.0, "yellow": -9.0}, {"blue": -9.0, "yellow": 0.0}) > 10.0
-    assert distance_of_landmarks({}, {}) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("given", "why"),
-    [
-        ({"names": ("blue",)}, "at least two different texts"),
-        ({"names": ("blue", "blue")}, "at least two different texts"),
-        ({"names": ("blue", "yellow"), "error": 1.5}, "a probability between 0 and 1"),
-        ({"names": ("blue", "yellow"), "confusion": (0.9, 0.2, 0.1, 0.9)}, "each 2 of the sum 1"),
-    ],
-)
-def test_odd_classes_are_refused(given: dict[str, Any], why: str) -> None:
-    with pytest.raises(ModelError, match=why):
-        km.Classes(**given)
 
 
 def test_an_unknown_class_is_refused_and_changes_nothing() -> None:
