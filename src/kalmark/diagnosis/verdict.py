@@ -231,16 +231,17 @@ def _with_cure(
 
 
 def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding]) -> tuple[float, Run, Log, Finding | None]:
-    """Return the cure with which the log of a run is likeliest, as `without_error`; none is tried after one that fits.
+    """Return the cure with which the log of a run is likeliest, as `without_error`.
 
-    Where it fitted before, each may.
+    After one with which a log fits that did not, only other sizes of that error are tried.
     """
     best: tuple[float, Run, Log, Finding | None] = 0.0, run, log, None
-    fitted = fit_of_run(run).mean < FITS
+    fitted, named = fit_of_run(run).mean < FITS, ""
     for finding in tried:
-        best = max(best, without_error(run, log, finding), key=lambda of: of[0])
-        if not fitted and fit_of_run(best[1]).mean < FITS:
-            break
+        if named in ("", finding.name):
+            best = max(best, without_error(run, log, finding), key=lambda of: of[0])
+        if not fitted and best[3] is not None and fit_of_run(best[1]).mean < FITS:
+            named = best[3].name
     return best
 
 
