@@ -90,7 +90,8 @@ def likeliest(
     every = Trials(log, events, config)
     tried = track(as_likely_as_a_few_kinds(changes), "the likeliest mistakes, one after the other", show=progress)
     made = [one for change in tried for one in every.explain(change)]
-    sizes = {(one.name, one.of): one for one in sorted(made, key=lambda one: one.gain)}  # the likeliest of each error
+    ordered = sorted(reversed(made), key=lambda one: one.gain)
+    sizes = {(one.name, one.of): one for one in ordered}  # the likeliest of each error, the first of equal ones
     made = [one for one in made if not one.of or one is sizes[one.name, one.of]]
     off = [*every.explain(Mistake(OUTLIERS, "", "", gated(config)))] if made else []
     return first_of([one for one in made if all(one.gain > other.gain for other in off)])
