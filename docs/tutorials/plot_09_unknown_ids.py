@@ -2,7 +2,8 @@
 Landmarks without ids
 =====================
 
-A sensor seldom identifies its landmarks. The association decides which landmark each observation is of, and gives the reason.
+A sensor seldom identifies its landmarks. The association decides which landmark each observation is of, and gives the
+reason.
 """
 
 # %%

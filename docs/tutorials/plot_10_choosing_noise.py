@@ -50,9 +50,9 @@ plt.show()
 # Which part is wrong
 # -------------------
 #
-# A NIS above 1 does not show which noise is too small. ``km.diagnose(run)`` names it, with the key of the configuration;
-# ``kalmark diagnose RUN`` prints it with its evidence, and ``kalmark tune CONFIG`` estimates all noises and
-# calibrations at once (:doc:`/diagnosis`, :doc:`/tuning`).
+# A NIS above 1 does not show which noise is too small. ``km.diagnose(run)`` names it, with the key of the
+# configuration; ``kalmark diagnose RUN`` prints it with its evidence, and ``kalmark tune CONFIG`` estimates all
+# noises and calibrations at once (:doc:`/diagnosis`, :doc:`/tuning`).
 #
 # Of a control
 # ------------
