@@ -21,8 +21,8 @@ Equation (52) is printed with the arctangent of a quotient, which loses the side
 #
 # The pose of the robot is known; it drives 2 m to the side in 40 steps. At each it measures the bearing of a landmark
 # ahead with 1 degree of noise. The prior of :math:`\rho` is that of (47) with 1 m, both ends at two sigmas; the one
-# of :math:`d` covers 0 to 20 m. Each of 200 runs has its own noise; the corrections are [S] (26) to (30) with one number
-# as the state.
+# of :math:`d` covers 0 to 20 m. Each of 200 runs has its own noise; the corrections are [S] (26) to (30) with one
+# number as the state.
 import matplotlib.pyplot as plt
 import numpy as np
 
