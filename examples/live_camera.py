@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 import kalmark as km
-from kalmark.config.data_sheets import calibration
+from kalmark.vision.calibration_key import calibration
 
 
 class Newest:

@@ -328,5 +328,5 @@ def test_the_options_of_any_log_are_those_of_open_log() -> None:
     parameters = inspect.signature(km.open_log).parameters.values()
     options = {each.name: each.default for each in parameters if each.kind is each.KEYWORD_ONLY} | {"format": None}
     declared = {name: field.default for name, field in LogConfig.model_fields.items()}
-    assert options.keys() - {"progress"} == declared.keys() - {"path"}
+    assert options.keys() - {"progress"} == declared.keys() - {"path", "without_events"}
     assert {name for name in declared.keys() & options.keys() if declared[name] != options[name]} == {"increments"}

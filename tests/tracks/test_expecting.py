@@ -156,7 +156,7 @@ def test_of_a_wall_the_part_of_its_segment_in_the_field_of_view_is_expected() ->
     np.testing.assert_allclose(found.e[0, 0], 3.0, atol=1e-9)
     np.testing.assert_allclose(np.sort(np.abs(found.e[0, 2:])), [1.0, 3.0], atol=1e-9)
     tracks.confirmed["wall"].extent = np.array([3.5, 9.0])
-    assert expected(m, tracks, channel).why == ("no part of its segment is in the image",)
+    assert expected(m, tracks, channel).why == ("no part of its segment is in view",)
 
 
 # ---------------------------------------------------------------------- in space

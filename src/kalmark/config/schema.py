@@ -33,11 +33,12 @@ from kalmark.logs import known_formats
 from kalmark.logs.formats import OPTIONS
 from kalmark.logs.source import Format
 from kalmark.models.protocols import state_columns
+from kalmark.picture_options import Picture as PictureOptions
 from kalmark.slam.description import STATES, sigma_of, state_names
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.state import Settings
 
-Picture = Annotated[Any, Choice("picture")]
+Picture = Annotated[Any, Choice(registered_name(PictureOptions) or "")]
 
 Plugins = Annotated[KeyPath, Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
