@@ -76,7 +76,8 @@ def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | N
     first = run if whole and config == run.config else filter_events(config, log, log.events)
     if first is None:
         return None
-    before, out = fit_of_run(first), _elsewhere(first.history)
+    before, h = fit_of_run(first), first.history
+    out = _elsewhere(h) & ~h.associated_elsewhere()[h.step]
     new = np.flatnonzero(first.history.outcome == "new") if len(before.values) == len(now.values) else None
     gain, mean = likelihood_gain(now, before, new), max(before.mean, 1.0)
     cure = CURE if gain > SURELY * mean else OWN_ID  # a gate helps no more where all of this is left out already

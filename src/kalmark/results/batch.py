@@ -141,10 +141,7 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
     robots = slam.robots
     landmarks = filtered_map(run)
     ids = {str(id_): id_ for id_ in landmarks} | {name: name for name in robots}
-    placed = history.fused
-    for gap in history.carried():  # elsewhere than the filter had it; the scan that placed it was associated there, too
-        elsewhere = (history.robot == gap.robot) & (gap.start_ns <= history.t_ns) & (history.t_ns <= gap.end_ns)
-        placed &= ~elsewhere[history.step]
+    placed = history.fused & ~history.associated_elsewhere()[history.step]
     again_begun = [change for change in history.changes if change.reason == BEGUN_AGAIN]
     for change in again_begun:
         placed &= (history.landmark != change.landmark) | (history.step > change.step)

@@ -427,6 +427,13 @@ class History:
         """Return which steps (S,) are of a robot that was elsewhere."""
         return (self.robot == gap.robot) & (self.t_ns >= gap.start_ns) & (self.t_ns < gap.end_ns)
 
+    def associated_elsewhere(self) -> Flags:
+        """Return at which steps (S,) a robot was not where its scan was associated; the scan that placed it counts."""
+        out = np.zeros(len(self.t_ns), dtype=np.bool_)
+        for gap in self.carried():
+            out |= (self.robot == gap.robot) & (gap.start_ns <= self.t_ns) & (self.t_ns <= gap.end_ns)
+        return out
+
     @property
     def in_space(self) -> bool:
         """True if the robots move in space."""
