@@ -38,7 +38,7 @@ from kalmark.slam.description import STATES, sigma_of, state_names
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.state import Settings
 
-Picture = Annotated[Any, Choice(registered_name(PictureOptions) or "")]
+Picture = Annotated[Any, Choice(registered_name(PictureOptions) or "")]  # it is registered by its import
 
 Plugins = Annotated[KeyPath, Field(strict=False)]
 Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]

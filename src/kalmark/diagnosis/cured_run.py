@@ -54,7 +54,7 @@ def apply_cure(run: Run, folder: Path, verdict: Verdict, observations: int) -> C
     cause, options = next((each for each in cures if each[1]), (None, []))
     if cause is None:
         return None
-    beside = folder.with_name(folder.name + ENDING)
+    beside = Path(f"{folder.resolve()}{ENDING}")  # a folder may be given as "."
     cured = run_log(folder / "config.yaml", overrides=options, own=beside)
     cured.save(beside, report=False)
     after = diagnose(cured, observations, progress=True)

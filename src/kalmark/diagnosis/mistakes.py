@@ -43,8 +43,8 @@ class Mistake(NamedTuple):
     `gain` is half of the chi-square that it explains, the logarithm of a likelihood ratio as of any other cause, and
     `since_s` since when it counts, in s of the log.  `shrunk` has the sensors
     of which a measurement is smaller without it, and the logarithm of by how much: its noise then explains more.
-    A size of a small error, which needs no such search where it is small, has `value` in `unit` and is `of` what the
-    error is (`causes.Finding`).
+    One that is a large size of an error of `causes`, which a score test finds while it is small, has that error's `of`,
+    `value` and `unit` (`causes.Finding`).
     """
 
     name: str
@@ -150,16 +150,18 @@ def _of_ranges(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
     """Yield that ranges alone are off by a constant, or, in the plane, of things at another height."""
     for sensor in (name for name, mount in robot.sensors.items() if tuple(mount.sensor.columns) == (RANGE,)):
         path, of = ("robots", robot_section(config, robot.name), "sensors", sensor), f"{robot.name}.{sensor}"
+        key = f"robots.{robot.name}.sensors.{sensor}"
         bias_m = float(configured_value(config, (*path, "bias_m")) or 0.0)
         for offset_m in OFFSETS_M:
             evidence = f"ranges of {of} are {abs(offset_m):g} m too {'long' if offset_m > 0 else 'short'}"
-            cure = f"--set robots.{of.replace('.', '.sensors.')}.bias_m={bias_m + offset_m:g}"
+            cure = f"--set {key}.bias_m={bias_m + offset_m:g}"
             changed = with_value(config, (*path, "bias_m"), bias_m + offset_m)
-            error = (robot.name, sensor, RANGE)
-            yield Mistake("range_offset", evidence, cure, changed, of=error, value=offset_m, unit="m")
+            yield Mistake(
+                "range_offset", evidence, cure, changed, of=(robot.name, sensor, RANGE), value=offset_m, unit="m"
+            )
         for height_m in HEIGHTS_M if robot.motion.space.axes == 1 else ():
             evidence = f"ranges of {of} fit only if they are of things {height_m:g} m above or below it"
-            cure = f"--set robots.{of.replace('.', '.sensors.')}.mount.z_m={-height_m:g}"
+            cure = f"--set {key}.mount.z_m={-height_m:g}"
             yield Mistake("height", evidence, cure, with_value(config, (*path, "mount", "z_m"), -height_m))
 
 

@@ -217,10 +217,10 @@ def _search(
     """
     for _ in range(STEPS):
         J = now.H.transpose(0, 2, 1) @ now.inverse
-        g, A = (J @ now.z[:, :, None]), J @ now.H
+        g, A = J @ now.z[:, :, None], J @ now.H
         A[:, [0, 1], [0, 1]] += 1e-12
-        left = (g * np.linalg.solve(A, g)).sum(axis=(1, 2))  # what chi-square may become less by
-        if left.max() < settled or (not all_ and left[np.argmin(now.cost)] < settled):
+        decrease = (g * np.linalg.solve(A, g)).sum(axis=(1, 2))  # of chi-square by a step without damping
+        if decrease.max() < settled or (not all_ and decrease[np.argmin(now.cost)] < settled):
             break
         first = _first_of_each(now.l, A)
         now, damping, g, A = now.of(first), damping[first], g[first], A[first]
