@@ -91,7 +91,7 @@ def test_a_sensor_of_the_state_that_would_be_taken_for_one_of_landmarks_is_refus
     Mount(Compass())
     assert all(finding.ok for finding in check_model(Compass(), np.random.default_rng(0)))
     Compass.views = "poze"
-    with pytest.raises(ModelError, match=r"Compass\.views is 'poze', expected 'pose', 'change' or 'twist'"):
+    with pytest.raises(ModelError, match=r"Compass\.views is 'poze', expected one of 'pose', 'change', 'twist'"):
         Mount(Compass())
     with pytest.raises(ModelError, match=r"Compass\.views is 'poze'"):
         check_model(Compass(), np.random.default_rng(0))

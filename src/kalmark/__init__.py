@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from kalmark.management.delayed import Delayed
     from kalmark.management.upkeep import Upkeep
     from kalmark.models import landmarks, motion, sensors
+    from kalmark.models.blocks import factor
     from kalmark.models.pointwise import pointwise
     from kalmark.report import Expectations, Observation, Report
     from kalmark.results.filter_picture import draw
@@ -41,8 +42,8 @@ __version__ = "0.1.0"
 __all__ = [
     "Attention", "Classes", "Control", "Delayed", "Expectations", "Fix", "Frame", "KalmarkError", "Log", "Mount",
     "Observation", "Report", "Robot", "Run", "Scan", "Slam", "Upkeep", "association", "detect", "draw", "estimators",
-    "geometry", "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets", "record",
-    "register", "sensors", "stream_log", "textbook",
+    "factor", "geometry", "initialization", "landmarks", "log_from", "motion", "open_log", "pointwise", "presets",
+    "record", "register", "sensors", "stream_log", "textbook",
 ]  # fmt: skip
 
 _MODULES = {
@@ -64,6 +65,7 @@ _NAMES = {
     "kalmark.management.attention": ("Attention",),
     "kalmark.management.delayed": ("Delayed",),
     "kalmark.management.upkeep": ("Upkeep",),
+    "kalmark.models.blocks": ("factor",),
     "kalmark.models.pointwise": ("pointwise",),
     "kalmark.report": ("Expectations", "Observation", "Report"),
     "kalmark.results.filter_picture": ("draw",),

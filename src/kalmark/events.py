@@ -215,6 +215,16 @@ def checked_classes(classes: Any, count: int) -> tuple[str | None, ...]:
     return tuple([None if each is None else str(checked_id(_text(each, "a class"), "a class")) for each in given])
 
 
+def checked_blocks(of: Any, count: int) -> tuple[tuple[Id, ...], ...]:
+    """Return the names of the blocks of each observation of a scan, refusing all but lists of different ones."""
+    given = list(of) if isinstance(of, list | tuple) else []
+    rows = [tuple(checked_id(name, "a name") for name in row) for row in given if isinstance(row, list | tuple)]
+    if len(given) != count or len(rows) != count or not all(row and len({*row}) == len(row) for row in rows):
+        wanted = f"a list of the names of different robots and landmarks for each of {count} observations"
+        raise EventError(f"of is {short_text(of)}, expected {wanted}")
+    return tuple(rows)
+
+
 def _text(value: Any, what: str) -> str:
     if not isinstance(value, str):
         raise EventError(f"{what} is {short_text(value)}, expected a text")
@@ -300,7 +310,8 @@ class Scan(_Timed):
 
     `ids` names the landmarks (None, for one or all of them: unknown).  `cov` of shape (m, m) for all or (K, m, m)
     overrides the noise of the sensor model.  `classes` are what the sensor reports of each (None: nothing),
-    which count where its mount has `km.Classes`.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
+    which count where its mount has `km.Classes`.  `of` names, for each observation of a sensor of blocks, the robots
+    and landmarks that it is of.  A scan that saw nothing, y = () or (0, m), has `y` of shape (0, 0);
     `width` is the m it was given, 0 for (), `largest` the largest magnitude in `y`, `largest_cov` in `cov`.
 
     >>> km.Scan(t_s=0.5, robot="rover", sensor="lidar", y=[[4.2, 0.3], [2.0, -0.1]], ids=[7, None]).ids
@@ -314,6 +325,7 @@ class Scan(_Timed):
     ids: tuple[Id | None, ...] | None
     cov: Array | None
     classes: tuple[str | None, ...] | None
+    of: tuple[tuple[Id, ...], ...] | None
     width: int = field(init=False, repr=False)
     largest: float = field(init=False, repr=False)
     largest_cov: float = field(init=False, repr=False)
@@ -329,6 +341,7 @@ class Scan(_Timed):
         *,
         t_ns: int | None = None,
         classes: Any = None,
+        of: Any = None,
     ) -> None:
         set_ = object.__setattr__
         t_ns = time_in_ns(t_s, t_ns, "scan", robot)
@@ -343,6 +356,7 @@ class Scan(_Timed):
             set_(self, "y", y if len(y) else y.reshape(0, 0))
             set_(self, "ids", None if ids is None else checked_ids(ids, len(y)))
             set_(self, "classes", None if classes is None else checked_classes(classes, len(y)))
+            set_(self, "of", None if of is None else checked_blocks(of, len(y)))
             cov, largest_cov = (None, 0.0) if cov is None else finite_and_largest(cov, "cov", MOST_OTHER**2)
             set_(self, "cov", cov)
             set_(self, "largest_cov", largest_cov)

@@ -447,3 +447,32 @@ def test_scans_that_are_late_by_a_known_lag_are_solved_at_the_times_of_what_they
     slam = build_slam(load_world("race_track", [*over, *lags, *unsure]).config(), log)
     with pytest.raises(KalmarkError, match=r"the lag of 'car.lidar' is in the map, expected lags that are known"):
         replay_events(batch_input(record(slam, log, progress=False)), log)
+
+
+def test_readings_between_blocks_are_residuals_with_their_jacobians() -> None:
+    tape = "robots.alpha.sensors.tape={type: distance, sigma_m: 0.001}"
+    between = "robots.alpha.sensing.tape={every: 20, between: [[1, 2], [alpha, beta], [alpha, 10]]}"
+    world = load_world("two_robots", ["steps=60", tape, between])
+    log = simulate(world, 1)
+    run = record(build_slam(world.config(), log), log, progress=False, pictures=False)
+    problem = replay_events(batch_input(run), log.events)
+    factors = [factor for factor in problem.factors if not factor.sensor[1] and not factor.absolute]
+    assert sorted(len(factor.y) for factor in factors) == [3, 3, 3]
+    for factor in factors:
+        E = factor.term.at(problem.start)[1]
+        at = factor.term.jacobian(E, problem.start)
+        rng, n = np.random.default_rng(0), problem.start.ends[-1]
+        for _ in range(3):
+            step = rng.normal(size=n)
+            ahead, behind = (factor.term.at(_plainly_moved(problem.start, by * step))[0] for by in (1e-6, -1e-6))
+            assert np.allclose(-(ahead - behind).ravel() / 2e-6, at @ step, atol=1e-6)
+    batch = solver.optimum(problem)
+    assert max(np.abs(factor.term.at(batch.state)[0]).max() for factor in factors) < 0.004
+    without = solver.optimum(replace(problem, factors=tuple(f for f in problem.factors if f not in factors)))
+    assert max(np.abs(factor.term.at(without.state)[0]).max() for factor in factors) > 0.01
+
+
+def _plainly_moved(state: BatchState, step: Array) -> BatchState:
+    """Return a state after a step, each number by plain plus."""
+    no_turn = [np.zeros((len(rows), 0)) for rows in state.groups]
+    return BatchState(state.spaces, tuple(map(plus, state.spaces, state.groups, state.parts(step), no_turn)))

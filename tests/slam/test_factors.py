@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,12 @@ import pytest
 
 import kalmark as km
 from kalmark.arrays import Array
+from kalmark.config import build_slam
 from kalmark.errors import EventError, KalmarkError, MapError
 from kalmark.geometry.rotations import from_euler
+from kalmark.logs import write_native
+from kalmark.logs.json_lines import event_of_object, line_of_event, mapping_of
+from kalmark.simulate import load_world, simulate
 
 ESTIMATORS = [km.estimators.Ekf(), km.estimators.Invariant(), km.estimators.Fej()]
 SIGHT = (0.1, 0.03)
@@ -220,3 +225,111 @@ def test_bad_factors_are_refused_and_change_nothing(
     assert message in str(caught.value) and "\n" not in str(caught.value)
     for one, other in zip(everything(slam), before, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def between(**sensors: Any) -> list[km.Robot]:
+    """Return two robots with a lidar and other sensors."""
+    mounts = {name: km.Mount(sensor) for name, sensor in sensors.items()}
+    mounts["lidar"] = km.Mount(km.sensors.RangeBearing(*SIGHT))
+    motion, P = km.motion.Odometry2D(0.1, 0.05, 0.02), 0.01 * np.eye(3)
+    return [km.Robot(name, motion, start, mounts, cov=P) for name, start in (("a", (0, 0, 0)), ("b", (0.5, 1, 0.2)))]
+
+
+def test_a_reading_between_landmarks_or_robots_is_what_fuse_does() -> None:
+    by_event, by_call = km.Slam(between(tape=km.sensors.Distance(0.05))), km.Slam(between())
+    for slam in (by_event, by_call):
+        observed(slam, np.random.default_rng(1), np.zeros(3), robot="a")
+    of = [[1, 2], ["a", "b"], [1, "unseen"]]
+    report = by_event.process(km.Scan(0.0, "a", "tape", [[3.7], [1.2], [9.0]], of=of))
+    expected = distance(by_call.mean(1), by_call.mean(2))
+    for names, y in ((of[0], 3.7), (of[1], 1.2)):
+        by_call.fuse(names, distance, y, 0.05**2)
+    assert [o.outcome for o in report.observations] == ["associated", "associated", "ignored"]
+    assert report.e[0] == pytest.approx(expected)
+    names = ["a", "b", 1, 2, 3]
+    np.testing.assert_allclose(by_event.covariance(*names), by_call.covariance(*names), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(by_event.mean(1), by_call.mean(1), atol=1e-7)
+
+
+def test_a_distance_to_a_landmark_of_unknown_depth_is_one_to_its_place() -> None:
+    eye = km.Mount(km.sensors.Bearing(0.01))
+    rover = km.Robot("r", km.motion.Odometry2D(), sensors={"eye": eye, "tape": km.Mount(km.sensors.Distance(0.01))})
+    slam = km.Slam(rover)
+    slam.process(km.Scan(0.0, "r", "eye", [[0.0]], ids=[1]))
+    assert slam.landmark_model(1).kind == "inverse_depth_2d"  # type: ignore[union-attr]
+    slam.process(km.Scan(0.0, "r", "tape", [[3.0]], of=[["r", 1]]))
+    np.testing.assert_allclose(slam.place(1)[0], [3.0, 0.0], atol=0.02)
+
+
+def test_a_sensor_of_one_function_measures_the_state_behind_a_pose() -> None:
+    speed = km.factor(lambda r: (r[3:4], np.eye(1, 6, 3)), noise=[0.1**2])
+    robot = km.Robot("r", km.motion.ConstantVelocity(), sensors={"speed": km.Mount(speed)}, cov=np.eye(6))
+    slam = km.Slam(robot)
+    slam.process(km.Scan(0.0, "r", "speed", [[2.0]]))
+    assert slam.mean("r")[3] == pytest.approx(2.0 / 1.01)
+    assert slam.covariance("r")[3, 3] == pytest.approx(0.01 / 1.01)
+
+
+def test_readings_between_blocks_are_in_logs_and_lines(tmp_path: Path) -> None:
+    scan = km.Scan(0.5, "a", "tape", [[3.0], [1.2]], of=[["door", 2], ["a", "b"]])
+    assert event_of_object(mapping_of(line_of_event(scan))).of == scan.of  # type: ignore[union-attr]
+    columns = {("a", "tape"): ("distance_m",)}
+    write_native(km.Log("log", ("a",), [scan], sensor_columns=columns), tmp_path / "log")
+    read = km.open_log(tmp_path / "log").events
+    assert [(e.of, e.ids, e.y.tolist()) for e in read] == [(scan.of, None, scan.y.tolist())]  # type: ignore[union-attr]
+    table = {"t_s": [0.5], "robot": "a", "sensor": "tape", "of": "door|2", "distance_m": [3.0]}
+    assert km.log_from(measurements=table).events[0].of == (("door", 2),)  # type: ignore[union-attr]
+    with pytest.raises(EventError, match=r"of is .*, expected a list of the names of different robots"):
+        km.Scan(0.5, "a", "tape", [[3.0]], of=[["door", "door"]])
+
+
+def test_a_world_with_readings_between_blocks_is_mapped_consistently() -> None:
+    tape = "robots.alpha.sensors.tape={type: distance, sigma_m: 0.05}"
+    world = load_world("two_robots", ["steps=60", tape, "robots.alpha.sensing.tape.between=[[1, 2], [alpha, beta]]"])
+    nees = []
+    for seed in range(12):
+        log = simulate(world, seed)
+        slam = build_slam(world.config(), log)
+        for event in log.events:
+            slam.process(event)
+        error = slam.mean("beta") - log.truth["beta"].poses[-1]
+        error[2] = km.geometry.wrap(error[2])
+        nees.append(error @ np.linalg.solve(slam.covariance("beta"), error))
+    assert 1.8 < np.mean(nees) < 4.6  # of 36 degrees of freedom, 99 %
+    with pytest.raises(KalmarkError, match="the world has no 'gamma'"):
+        simulate(load_world("two_robots", ["steps=1", tape, "robots.alpha.sensing.tape.between=[[1, gamma]]"]))
+
+
+class Cart(km.motion.Thing):
+    """Position and velocity on a rail."""
+
+    state, columns = km.geometry.Rn(2), ("a_mps2",)
+
+    def step(self, x: Array, u: Array, dt_s: float) -> tuple[Array, Array, Array]:
+        F, B = np.array([[1.0, dt_s], [0.0, 1.0]]), np.array([[dt_s**2 / 2], [dt_s]])
+        return F @ x + B @ u, F, B
+
+    def gathered(self, u: Array, dt_s: float) -> Array:
+        return 0.1**2 * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+
+    def control_noise(self, u: Array) -> Array:
+        return np.array([[0.2**2]])
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
+def test_a_state_of_numbers_is_filtered_by_the_linear_kalman_filter(estimator: Any) -> None:
+    C = np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])
+    gauge = km.Mount(km.factor(lambda r: (C @ r, C), noise=[[0.1**2]]))
+    P0 = np.diag([0.0, 0.0, 0.0, 1.0, 1.0])
+    cart = km.Robot("cart", Cart(), start=(0, 0, 0, 1.0, 0.0), cov=P0, sensors={"gauge": gauge})
+    slam, x, P, H = km.Slam(cart, estimator=estimator), np.array([1.0, 0.0]), np.eye(2), C[:, 3:]
+    for k in range(6):  # [F] 11.3
+        u, y = np.array([0.3 - 0.1 * k]), 1.0 + 0.3 * k
+        slam.process(km.Control(0.5 * k, "cart", u))
+        slam.process(km.Scan(0.5 * k + 0.5, "cart", "gauge", [[y]]))
+        moved, F, B = Cart().step(x, u, 0.5)
+        P = F @ P @ F.T + B @ Cart().control_noise(u) @ B.T + Cart().gathered(u, 0.5)
+        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + 0.1**2)
+        x, P = moved + K @ (y - H @ moved), P - K @ H @ P
+    np.testing.assert_allclose(slam.mean("cart"), [0.0, 0.0, 0.0, *x], atol=1e-10)
+    np.testing.assert_allclose(slam.covariance("cart")[3:, 3:], P, atol=1e-10)

@@ -244,5 +244,5 @@ def test_heights_of_a_receiver_have_a_noise_of_their_own() -> None:
 
 
 def test_what_measures_its_robot_expects_no_landmark() -> None:
-    with pytest.raises(MapError, match="sensor 'gyro' of 'r' measures its robot, expected one of landmarks"):
+    with pytest.raises(MapError, match="sensor 'gyro' of 'r' measures no landmarks, expected one of landmarks"):
         km.Slam(robot()).expect("r", "gyro")

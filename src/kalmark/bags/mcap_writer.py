@@ -19,6 +19,7 @@ string sensor
 string[] columns
 string[] ids
 string[] classes
+string[] of
 float64[] values
 float64[] covariance
 """

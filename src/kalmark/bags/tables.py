@@ -29,8 +29,8 @@ from kalmark.bags.mcap_writer import RECORD, Outgoing, header_fields
 from kalmark.errors import EventError, LogError
 from kalmark.events import Control, Event, Fix, Raw, Scan, label_of_event, sort_key
 from kalmark.logs.log import LandmarkPlaces, Log, PositionTrack, Trajectory
-from kalmark.logs.native_writer import id_text
-from kalmark.logs.source import Request, landmark_id
+from kalmark.logs.native_writer import id_text, names_text
+from kalmark.logs.source import Request, landmark_id, names_of_text
 from kalmark.logs.table_columns import GPS as GPS_COLUMNS
 from kalmark.logs.table_columns import POSE2, POSE3, POSITION
 
@@ -75,7 +75,7 @@ def _plain(value: Any) -> Any:
 
 def record_message(
     topic: str, t_ns: int, robot: str, values: Any, sensor: str = "", columns: Any = (), ids: Any = (), cov: Any = None,
-    classes: Any = (),
+    classes: Any = (), of: Any = (),
 ) -> Outgoing:  # fmt: skip
     """Return one kalmark_msgs/Record."""
     fields = {
@@ -85,7 +85,8 @@ def record_message(
         "sensor": sensor,
         "columns": list(columns),
     }
-    fields |= {"ids": list(ids), "classes": list(classes), "values": values, "covariance": () if cov is None else cov}
+    fields |= {"ids": list(ids), "classes": list(classes), "of": list(of), "values": values}
+    fields |= {"covariance": () if cov is None else cov}
     return Outgoing(topic, RECORD, t_ns, fields)
 
 
@@ -102,7 +103,8 @@ def record_of_event(log: Log, event: Event) -> Outgoing:
     columns = log.sensor_columns.get((event.robot, event.sensor), ())
     ids = ["" if id_ is None else id_text(id_) for id_ in event.ids or ()]
     classes = [of or "" for of in event.classes or ()]
-    return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov, classes)
+    of = [names_text(names) for names in event.of or ()]
+    return record_message(SCANS, event.t_ns, event.robot, event.y, event.sensor, columns, ids, event.cov, classes, of)
 
 
 def pose_records(robot: str, path: Trajectory) -> Iterator[Outgoing]:
@@ -170,4 +172,5 @@ def event_of_message(received: Received) -> Event:
         cov = cov.reshape(size, size) if len(cov) == size * size and len(y) > 1 else cov.reshape(len(y), size, size)
     ids = [landmark_id(text) if text else None for text in m.ids] if len(m.ids) else None
     classes = [of or None for of in getattr(m, "classes", ())] or None  # an older file has none
-    return Scan(t_ns=int(m.t_ns), robot=m.robot, sensor=m.sensor, y=y, ids=ids, cov=cov, classes=classes)
+    of = [names_of_text(text) for text in getattr(m, "of", ())] or None
+    return Scan(t_ns=int(m.t_ns), robot=m.robot, sensor=m.sensor, y=y, ids=ids, cov=cov, classes=classes, of=of)

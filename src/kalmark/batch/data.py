@@ -19,14 +19,22 @@ from scipy.sparse.csgraph import connected_components
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES, BatchState, Ints, unsolvable_problem
 from kalmark.batch.motion_chain import Chain, Starts
-from kalmark.batch.problem import Block, Factor, Problem, motionless, observation_factor, positions
+from kalmark.batch.problem import Block, Factor, Problem, between, motionless, observation_factor, positions
 from kalmark.batch.wall_anchors import anchors
 from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event, sort_events
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import mount_space
 from kalmark.models.landmarks import Point2D, Wall2D
 from kalmark.models.observe import inverse_expectation, view_of
-from kalmark.models.protocols import FullSensor, Landmark, NonAdditiveSensor, Ranging, Sensor, sees_kinds
+from kalmark.models.protocols import (
+    FullSensor,
+    Landmark,
+    NonAdditiveSensor,
+    Ranging,
+    Sensor,
+    measures_blocks,
+    sees_kinds,
+)
 from kalmark.models.walls import axes
 from kalmark.slam.checks import measurements
 from kalmark.slam.sources import RawDetector
@@ -49,6 +57,15 @@ class BatchObservation(NamedTuple):
     y: Array
     R: Array
     row: int
+
+
+class BetweenBlocks(NamedTuple):
+    """An observation y (m,) of a sensor of blocks, noise R (m, m), `of` nodes of robots and landmarks, by group."""
+
+    sensor: Any
+    of: tuple[tuple[int, Any], ...]
+    y: Array
+    R: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +99,9 @@ class BatchInput:
     `biases` are the constants (c,) of the controls of a robot.
 
     With `segments` (J, 2), from and to in ns, the events between them are left out, and so is how a robot came from one
-    to the next.  `carried` are the times, in ns, by which a robot had come elsewhere in an unknown way.
+    to the next.  Of sensors of blocks the observations `between` count, by time in ns, robot, sensor and number;
+    landmarks that are `merged` are others.  `carried` are the times, in ns, by which a robot had come elsewhere in an
+    unknown way.
     """
 
     robots: Mapping[str, Robot]
@@ -102,6 +121,8 @@ class BatchInput:
     biases: Mapping[str, Array] = field(default_factory=dict)
     segments: Ints | None = None
     carried: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    between: frozenset[tuple[int, str, str, int]] = frozenset()
+    merged: Mapping[str, Id] = field(default_factory=dict)
 
     def seen_by(self, sensor: Sensor) -> Landmark:
         """Return what a landmark is to a sensor: in a map with walls a point is the first two of three numbers."""
@@ -154,6 +175,7 @@ class BatchReplay:
         self.apart: dict[tuple[str, int], int] = {}  # nodes without motion, by robot and time
         self.observed: dict[tuple[str, str, int], list[BatchObservation]] = {}  # by robot, sensor and group
         self.fixes: list[tuple[int, Array, Array]] = []
+        self.between: list[BetweenBlocks] = []
         self.fixed = 0  # fixes so far, with those that do not count
         self.nodes: list[int] = []
         self.segment: dict[str, int] = {}  # that a robot is in
@@ -204,8 +226,24 @@ class BatchReplay:
                 self.fixes.append((self._node(event.robot, event.t_ns), event.y, event.cov))
         elif step < len(given.t_ns) and (event.t_ns, event.robot) == (given.t_ns[step], given.robot[step]):
             self.nodes.append(self._node(event.robot, event.t_ns))
+            if isinstance(event, Scan) and measures_blocks(given.robots[event.robot].sensors[event.sensor].sensor):
+                self._between(event)
             if step in self.rows:
                 self._scan(self._found(event), self.rows[step])
+
+    def _between(self, scan: Scan) -> None:
+        """Take the observations of a sensor of blocks that the filter used."""
+        sensor: Any = self.given.robots[scan.robot].sensors[scan.sensor].sensor
+        R = measurements(scan, sensor)
+        for k, names in enumerate(scan.of or ((scan.robot,),) * len(scan.y)):
+            if (scan.t_ns, scan.robot, scan.sensor, k) in self.given.between:
+                of = tuple(
+                    (POSES, self._node(str(name), scan.t_ns))
+                    if name in self.given.robots
+                    else (LANDMARKS, self.given.merged.get(str(name), name))
+                    for name in names
+                )
+                self.between.append(BetweenBlocks(sensor, of, scan.y[k], R[k]))
 
     def _counts(self, event: Event) -> bool:
         """Return whether an event is in one of the segments; where a robot comes to the next one it is lost."""
@@ -302,7 +340,8 @@ class BatchReplay:
             seen += anchored
         kind = "tag" if given.landmark.kind == "tag" else "landmark"
         robots = [node.robot for node in self.chain.nodes] if given.motion else [robot for robot, _ in self.apart]
-        return Problem(motion, (*seen, *self._positions(names)), free, state, names, nodes, robots, kind)
+        others = *self._positions(names), *self._between_factors(names, state)
+        return Problem(motion, (*seen, *others), free, state, names, nodes, robots, kind)
 
     def _names(self) -> list[Id]:
         """Return the landmarks.  One that was measured by fewer numbers than it has is left out."""
@@ -311,6 +350,8 @@ class BatchReplay:
             for one in seen if group == LANDMARKS else ():
                 if one.target is not None:
                     numbers[one.target] = numbers.get(one.target, 0) + len(one.R)
+        named = (name for one in self.between for group, name in one.of if group == LANDMARKS)
+        numbers |= {name: 0 for name in named if name not in numbers}
         walls = isinstance(self.given.landmark, Wall2D)  # two numbers are measured of a wall, and two of a point
         least = 2 if walls else self.given.landmark.space.dof
         return [name for name, k in numbers.items() if k >= least or name in self.known]
@@ -369,6 +410,22 @@ class BatchReplay:
         known = [(k, *self.known[name]) for k, name in enumerate(names) if name in self.known]
         given = ((POSES, self.fixes), (LANDMARKS, [row for row in known if row[2] is not None]))
         return [positions(group, *(np.array(c) for c in zip(*rows, strict=True))) for group, rows in given if rows]
+
+    def _between_factors(self, names: list[Id], state: BatchState) -> list[Factor]:
+        """Return the factors of sensors of blocks, one of each sensor and kinds of blocks."""
+        at, found = {name: k for k, name in enumerate(names)}, dict[Any, list[Any]]()
+        for sensor, of, y, R in self.between:
+            rows = [at.get(target, -1) if group == LANDMARKS else target for group, target in of]
+            if -1 not in rows:
+                groups = tuple(group for group, _ in of)
+                found.setdefault((id(sensor), groups), [sensor, []])[1].append((rows, y, R))
+        factors = []
+        for (_, groups), (sensor, seen) in found.items():
+            of_rows, y, R = (np.array(part) for part in zip(*seen, strict=True))
+            blocks = tuple(Block(g, of_rows[:, i], state.spaces[g]) for i, g in enumerate(groups))
+            models = [self.given.landmark if g == LANDMARKS else None for g in groups]
+            factors.append(between(sensor, blocks, models, y, R))
+        return factors
 
     def _value(self, name: Id, poses: Array) -> Array:
         """Return where the map, or else its first observation, puts a landmark."""

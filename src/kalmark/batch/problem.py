@@ -7,7 +7,7 @@ of a pose, an exact start has none.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,6 +17,7 @@ import scipy.sparse as sp
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import (
+    LANDMARKS,
     POSE_SPACES,
     POSES,
     BatchState,
@@ -28,6 +29,8 @@ from kalmark.events import Id
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.spaces import POINT2, POINT3, Space
 from kalmark.models.observe import innovations_and_jacobians
+from kalmark.models.protocols import PLACES
+from kalmark.slam.factors import BlockMeasurement, MeasuredBlock
 
 DIFFERENCE = 1e-5  # m and rad
 
@@ -95,7 +98,8 @@ class Rows(NamedTuple):
 class Factor:
     """A term with independent noise `R` (K, p, p); residuals that are longer than `huber` when whitened count less.
 
-    `y` (K, m) is what was measured, by a `sensor` of a robot with a `view` of the landmarks; ("", "") for a survey.
+    `y` (K, m) is what was measured, by a `sensor` of a robot with a `view` of the landmarks; ("", "") for a survey and
+    between blocks.  `absolute`: y are positions.
     """
 
     term: Term
@@ -104,6 +108,12 @@ class Factor:
     huber: float = np.inf
     sensor: tuple[str, str] = ("", "")
     view: Any = None
+    absolute: bool = False
+
+    @property
+    def is_survey(self) -> bool:
+        """True of the positions of surveyed landmarks."""
+        return self.absolute and self.term.blocks[0].group == LANDMARKS
 
     def rows(self, state: BatchState) -> Rows:
         """Return the whitened residuals and what they sum up to."""
@@ -141,7 +151,26 @@ def observation_factor(
 def positions(group: int, rows: Ints, y: Array, R: Array) -> Factor:
     """Return absolute positions y (K, d) with noise R (K, d, d) of rows (K,) of a group."""
     E, space = np.tile(np.eye(y.shape[1]), (len(y), 1, 1)), POINT2 if y.shape[1] == 2 else POINT3
-    return Factor(Term(lambda p: (y - p, E), (Block(group, rows, space),)), y, R)
+    return Factor(Term(lambda p: (y - p, E), (Block(group, rows, space),)), y, R, absolute=True)
+
+
+def between(sensor: Any, blocks: tuple[Block, ...], models: Sequence[Any], y: Array, R: Array) -> Factor:
+    """Return what a sensor of blocks measured, y (K, m) with noise R (K, m, m), of landmarks of the `models`.
+
+    The model of a pose is None.
+    """
+    angular, places = np.array(sensor.angular, dtype=np.bool_), sensor.views == PLACES
+
+    def residuals(*values: Array) -> tuple[Array, Array]:
+        found = []
+        for k, x in enumerate(zip(*values, strict=True)):
+            of = BlockMeasurement([], sensor.expect, y[k], R[k], angular, type(sensor).__name__, places)
+            parts = [MeasuredBlock(0, b.space, x_b, of_b) for b, x_b, of_b in zip(blocks, x, models, strict=True)]
+            e, G = of.linearize(parts, x)
+            found.append((of.residual(y[k], e), G))
+        return np.array([z for z, _ in found]), np.array([G for _, G in found])
+
+    return Factor(Term(residuals, blocks), y, R)
 
 
 def _sparse(E: Array, row: Ints, column: Ints, shape: tuple[int, int]) -> sp.csr_array:

@@ -424,7 +424,7 @@ def _surveyed(linear: Linear) -> Iterator[tuple[float, int, Array, int, Ints, Ar
     surveys: list[tuple[int, Array, int, Ints]] = []
     for f, factor in enumerate(problem.factors):
         block = factor.term.blocks[0]
-        if factor.sensor[1] == "" and block.group == LANDMARKS:
+        if factor.is_survey:
             at_factor = np.flatnonzero((rows.factor == f) & linear.kept)
             of = [at_factor[rows.row[at_factor] == k] for k in range(len(factor.y))]
             surveys += [(l, *rest) for l, *rest in zip(block.rows.tolist(), factor.y, [-1] * len(of), of, strict=True)]

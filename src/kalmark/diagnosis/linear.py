@@ -132,7 +132,7 @@ class Linear:
     @property
     def surveys(self) -> Flags:
         """Flags (N,) of the residuals of surveyed landmarks."""
-        of = [f.sensor[1] == "" and f.term.blocks[0].group == LANDMARKS for f in self.problem.factors]
+        of = [f.is_survey for f in self.problem.factors]
         return np.array(of, dtype=np.bool_)[self.rows.factor]
 
     @cached_property

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -34,7 +35,8 @@ def cut_increments(log: Log) -> Log:
     events: list[Event] = [event for event in log.events if not isinstance(event, Control)]
     asked: dict[str, set[int]] = defaultdict(set)
     for event in events:
-        for robot in (event.robot, *((event.ids or ()) if isinstance(event, Scan) else ())):
+        seen = (*(event.ids or ()), *chain(*(event.of or ()))) if isinstance(event, Scan) else ()
+        for robot in (event.robot, *seen):
             asked[str(robot)].add(event.t_ns)
     for robot in log.robots:
         controls = [event for event in log.events if isinstance(event, Control) and event.robot == robot]

@@ -14,7 +14,7 @@ LONGEST_LINE = 10_000_000  # characters: more than any scan has
 _TIMES = ("t_s", "t_ns", "robot")
 KEYS: dict[str, tuple[type[Control | Scan | Fix], Names]] = {
     "control": (Control, (*_TIMES, "u", "cov", "share", "uneven")),
-    "scan": (Scan, (*_TIMES, "sensor", "y", "ids", "cov", "classes")),
+    "scan": (Scan, (*_TIMES, "sensor", "y", "ids", "cov", "classes", "of")),
     "fix": (Fix, (*_TIMES, "y", "cov")),
 }
 """By their `type`: the events, and the keys that they have."""

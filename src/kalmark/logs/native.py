@@ -1,9 +1,9 @@
 """Read kalmark's own log, a folder of CSV files with headers (docs/datasets.md, "Native logs").
 
 `controls.csv`  t_s, robot, the control's columns[, own noise]
-`scans.csv`     t_s, robot, sensor, id[, class], the sensors' columns[, own noise]; a sensor leaves the others' columns
-                empty
-`measurements.csv` t_s, robot, sensor, the sensors' columns[, own noise]: scans of one row without an id
+`scans.csv`     t_s, robot, sensor, id[, class][, of], the sensors' columns[, own noise]; a sensor leaves the others'
+                columns empty; `of` has the names of the blocks that a sensor of blocks measures: `door|mast`
+`measurements.csv` t_s, robot, sensor[, of], the sensors' columns[, own noise]: scans of one row without an id
 `fixes.csv`     t_s, robot, x_m, y_m[, z_m], own noise
 `truth.csv`     t_s, robot, x_m, y_m, theta_rad | x_m, y_m, z_m, qx, qy, qz, qw
 `landmarks.csv` id, x_m, y_m[, z_m][, x2_m, y2_m, z2_m | qx, qy, qz, qw]: points, both ends of lines, poses of tags;
@@ -148,6 +148,7 @@ class _Rows:
     y: list[list[float]] = field(default_factory=list)
     ids: list[Id | None] = field(default_factory=list)
     classes: list[str | None] = field(default_factory=list)
+    of: list[list[Id]] = field(default_factory=list)
     covs: list[Array | None] = field(default_factory=list)
     lines: list[int] = field(default_factory=list)
     empty: bool = False
@@ -219,7 +220,8 @@ class _NativeReader:
         covs = [cov for cov in rows.covs if cov is not None]
         cov = np.array(covs) if covs else None
         classes = rows.classes if any(rows.classes) else None
-        yield Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=rows.ids, cov=cov, classes=classes)
+        ids, of = (None, rows.of) if any(rows.of) else (rows.ids, None)
+        yield Scan(t_ns=rows.t_ns, robot=robot, sensor=sensor, y=rows.y, ids=ids, cov=cov, classes=classes, of=of)
 
     def add(self, rows: _Rows, row: Row) -> None:
         """Add one row of `scans.csv` to its scan.  Raises Refused."""
@@ -238,6 +240,7 @@ class _NativeReader:
         rows.y.append(y)
         rows.ids.append(name)
         rows.classes.append((row.text("class") if "class" in row.table.index else "") or None)
+        rows.of.append(row.names("of"))
         rows.covs.append(cov)
         rows.lines.append(row.line)
 
@@ -247,7 +250,8 @@ class _NativeReader:
         def make(row: Row) -> Event:
             self.note(row)
             y, cov = row.measured(self.columns)
-            return Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov)
+            of = row.names("of")
+            return Scan(t_ns=row.t_ns, robot=row.robot, sensor=row.sensor, y=[y], cov=cov, of=[of] if of else None)
 
         table = read_table(path, ("t_s", "robot", "sensor"), known=known_columns(), globe=self.globe)
         return table.made(self.request, make, by_sensor=True)

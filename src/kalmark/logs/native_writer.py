@@ -16,7 +16,7 @@ from kalmark.events import Control, Event, Fix, Id, Raw, Scan, fixed_seconds
 from kalmark.files import replace_folder
 from kalmark.logs.log import Log, Names
 from kalmark.logs.native import FILES, LANDMARKS, RIG, TABLES
-from kalmark.logs.source import landmark_id, nanoseconds_of_text
+from kalmark.logs.source import BETWEEN, landmark_id, names_of_text, nanoseconds_of_text
 from kalmark.logs.table import PARQUET, cov_columns
 from kalmark.logs.table_columns import CANONICAL, GPS, NAMES, POSE2, POSE3, POSITION
 from kalmark.plugins import load
@@ -124,9 +124,14 @@ def scans(log: Log) -> Iterator[Row]:
         if not count:
             yield begin
         covs = [None] * count if s.cov is None else np.broadcast_to(s.cov, (count, size, size))
-        for y, id_, of, cov in zip(s.y, s.ids or [None] * count, s.classes or [None] * count, covs, strict=True):
+        nothing = [None] * count
+        rows = zip(s.y, s.ids or nothing, s.classes or nothing, s.of or nothing, covs, strict=True)
+        for y, id_, class_, of, cov in rows:
             own = numbers(log.sensor_columns, (s.robot, s.sensor), y) | upper_triangle(cov, f"scan at {s.t_s} s")
-            yield begin | ({} if id_ is None else {"id": id_text(id_)}) | ({} if of is None else {"class": of}) | own
+            told = {
+                "id": "" if id_ is None else id_text(id_), "class": class_, "of": of and names_text(of)
+            }  # fmt: skip
+            yield begin | {key: text for key, text in told.items() if text is not None} | own
 
 
 def fixes(log: Log) -> Iterator[Row]:
@@ -205,4 +210,12 @@ def id_text(id_: Id) -> str:
         name(text)
     if landmark_id(text) != id_:
         raise LogError(f"id {id_!r} would be read back as {landmark_id(text)!r}, expected an integer or a word")
+    return text
+
+
+def names_text(names: Sequence[Id]) -> str:
+    """Return the names of blocks as one text.  Raises LogError if it would be read back as others."""
+    text = BETWEEN.join(map(id_text, names))
+    if names_of_text(text) != [*names]:
+        raise LogError(f"names {[*names]} would be read back as {names_of_text(text)}, expected none with {BETWEEN!r}")
     return text

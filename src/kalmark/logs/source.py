@@ -211,6 +211,14 @@ def landmark_id(text: str) -> Id:
     return int(text) if _INTEGER.fullmatch(text) else text
 
 
+BETWEEN = "|"  # names of several blocks in one text
+
+
+def names_of_text(text: str) -> list[Id]:
+    """Return the robots and landmarks of a text that has several, or ValueError if one is too long."""
+    return [landmark_id(part.strip()) for part in text.split(BETWEEN)]
+
+
 def number_of_text(text: str, limit: float = MOST_OTHER**2) -> float:
     """Return a finite number of at most `limit` (of a variance, as the widest), or ValueError."""
     value = float(text)

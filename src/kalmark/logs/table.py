@@ -30,6 +30,7 @@ from kalmark.logs.progress import track
 from kalmark.logs.source import (
     Request,
     landmark_id,
+    names_of_text,
     nanoseconds_of_text,
     number_of_text,
     read_text,
@@ -377,13 +378,19 @@ class Row:
 
     def id(self) -> Id | None:
         """Return the landmark's id, None for an empty cell.  Raises Refused."""
-        cell, text = self.cells[self.table.index["id"]], self.text("id")
+        return next(iter(self.names("id")), None)
+
+    def names(self, column: str) -> list[Id]:
+        """Return the robots and landmarks of a cell, none of an empty or missing one.  Raises Refused."""
+        if column not in self.table.index:
+            return []
+        cell, text = self.cells[self.table.index[column]], self.text(column)
         if type(cell) is float and cell.is_integer():  # as tables in memory make numbers beside empty cells
             text = str(int(cell))
         try:
-            return landmark_id(text) if text else None
+            return [] if not text else names_of_text(text) if column == "of" else [landmark_id(text)]
         except ValueError as error:
-            raise Refused(f"id: {error}") from None
+            raise Refused(f"{column}: {error}") from None
 
     def new_id(self, known: Container[Id]) -> Id:
         """Return the id of a landmark that is not known yet.  Raises Refused."""

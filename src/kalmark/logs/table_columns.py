@@ -15,7 +15,7 @@ WHEELS = ("left_rad", "right_rad")
 CORNERS = ("u1_px", "v1_px", "u2_px", "v2_px", "u3_px", "v3_px", "u4_px", "v4_px", "size_m")
 GPS = ("x_m", "y_m", "antenna_x_m", "antenna_y_m")
 
-NAMES = ("t_s", "robot", "sensor", "id", "class")
+NAMES = ("t_s", "robot", "sensor", "id", "class", "of")
 CONTROL = (
     "v_mps", "vx_mps", "vy_mps", "vz_mps", "w_radps", "wx_radps", "wy_radps", "wz_radps",
     "ax_mps2", "ay_mps2", "az_mps2", "steering_rad",

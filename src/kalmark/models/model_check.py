@@ -69,7 +69,7 @@ def check_model(model: Any, rng: Rng) -> list[CheckResult]:
         raise ModelError(f"{name} has no {', '.join(missing)}")
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        check(model, rng, found)
+        (_of_blocks if protocols.measures_blocks(model) else check)(model, rng, found)
     return [*found.worst.values()]
 
 
@@ -90,8 +90,9 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
 
     _shape("state of move", move(r, u)[0], (DRAWS, space.size))
     found.jacobian("R_r", lambda x: move(x, u)[:2], r, space, space, at)
-    found.jacobian("R_u", lambda x: move(r, x)[::2], u, Rn(k), space, at)
-    found.covariance("control_noise", [*map(model.control_noise, u)], k, at)
+    if k:
+        found.jacobian("R_u", lambda x: move(r, x)[::2], u, Rn(k), space, at)
+        found.covariance("control_noise", [*map(model.control_noise, u)], k, at)
     of_state = isinstance(model, protocols.StateDiffusion)
     gathered = map(model.diffusion_at, r, u, dt_s) if of_state else map(model.diffusion, u, dt_s)
     diffusion = [D for D in gathered if D is not None]
@@ -150,6 +151,30 @@ def _sensor(model: Any, rng: Rng, found: _Findings) -> None:
             return _expect(model.with_parameters(x[0]), v, y)[0], E_p
 
         found.jacobian("E_p", by_parameters, a, Rn(a.shape[1]), measured, {"v": v})
+
+
+def _of_blocks(model: Any, rng: Rng, found: _Findings) -> None:
+    """Check what a sensor of blocks expects, of as many places or means as `expect` takes, and its own Jacobians."""
+    m, count = len(model.columns), len(inspect.signature(model.expect).parameters)
+    parts: list[Any] = []
+    for n in (2, 3) if model.views == protocols.PLACES else range(1, LARGEST + 1):
+        draws = rng.normal(0, 2, (DRAWS, count, n))
+        with suppress(Exception):  # this only tries
+            parts = [protocols.with_jacobians(model.expect(*x)) for x in draws]
+            e = np.array([np.ravel(part[0]) for part in parts])
+            if e.shape == (DRAWS, m) and (len(parts[0]) == 1 or np.shape(parts[0][1]) == (m, n)):
+                break
+    else:
+        raise ModelError(f"expect returns no expectation ({m},) of {count} blocks of 1 to {LARGEST} numbers")
+    for i in range(len(parts[0]) - 1):
+        E = np.array([part[1 + i] for part in parts])
+
+        def value(x: Array, i: int = i, E: Array = E) -> tuple[Array, Array]:
+            rows = [model.expect(*old[:i], one, *old[i + 1 :]) for old, one in zip(draws, x, strict=True)]
+            return np.array([np.ravel(protocols.with_jacobians(row)[0]) for row in rows]), E
+
+        found.jacobian(f"E_{i + 1}", value, draws[:, i], Rn(n), Rn(m), {"x": draws.reshape(DRAWS, -1)})
+    found.covariance("noise", model.noise(e), m, {"y": e})
 
 
 def _expect(model: Any, v: Array, y: Array) -> tuple[Array, Array]:

@@ -40,6 +40,7 @@ from kalmark.models.kinematics import (
     arc,
 )
 from kalmark.models.observe import CompiledVelocity
+from kalmark.models.things import Thing
 
 __all__ = [
     "Ackermann",
@@ -54,6 +55,7 @@ __all__ = [
     "Odometry3D",
     "Omnidirectional",
     "SlippingUnicycle",
+    "Thing",
     "Tricycle",
     "Unicycle",
     "Velocity3D",

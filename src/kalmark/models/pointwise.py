@@ -88,6 +88,16 @@ class NoisyPointwiseFullSensor(PointwiseFullSensor):
     noise_at = _noise_at
 
 
+def noise_covariance(noise: Any, what: str) -> Array:
+    """Return the covariance (m, m) of a noise.  Raises ModelError if it is none, with `what` it is of."""
+    R = np.atleast_2d(np.asarray(noise, dtype=np.float64))
+    if R.ndim != 2 or R.shape[0] != R.shape[1] or not np.isfinite(R).all():
+        raise ModelError(f"{what}: noise has shape {R.shape}, expected a finite square covariance")
+    if not np.allclose(R, R.T) or np.linalg.eigvalsh(R).min() <= 0:
+        raise ModelError(f"{what}: noise is {R.tolist()}, expected a symmetric positive definite matrix")
+    return R
+
+
 def pointwise(
     measure: Callable[..., Any],
     noise: Any,
@@ -109,11 +119,7 @@ def pointwise(
     >>> squared.expect(np.array([[3.0, 4.0]]))[0].round(3)
     array([[25.]])
     """
-    R = np.atleast_2d(np.asarray(noise, dtype=np.float64))
-    if R.ndim != 2 or R.shape[0] != R.shape[1] or not np.isfinite(R).all():
-        raise ModelError(f"pointwise sensor: noise has shape {R.shape}, expected a finite square covariance")
-    if not np.allclose(R, R.T) or np.linalg.eigvalsh(R).min() <= 0:
-        raise ModelError(f"pointwise sensor: noise is {R.tolist()}, expected a symmetric positive definite matrix")
+    R = noise_covariance(noise, "pointwise sensor")
     m = len(angular) or len(columns) or len(R)
     kinds = (PointwiseSensor, NoisyPointwiseSensor), (PointwiseFullSensor, NoisyPointwiseFullSensor)
     return kinds[inverse is not None][noise_inside](

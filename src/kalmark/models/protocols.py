@@ -359,6 +359,11 @@ class Visible(Capability, Protocol):
         """Return which of v (K, d), in the sensor's frame, can be measured."""
 
 
+def in_view(sensor: Sensor, v: Array) -> Flags:
+    """Return which of v (K, d), in the sensor's frame, can be measured; by default all."""
+    return sensor.sees(v) if isinstance(sensor, Visible) else np.ones(len(v), dtype=np.bool_)
+
+
 @runtime_checkable
 class SegmentVisible(Capability, Protocol):
     """A sensor that measures parts of line segments.
@@ -419,11 +424,16 @@ class SeesVelocity(Capability, Protocol):
 
 
 POSE, CHANGE, TWIST = "pose", "change", "twist"  # the views of a sensor of the state, see `models/state_view.py`
+BLOCKS, PLACES = "blocks", "places"  # what a sensor of any blocks is given: their means, or where they are
 
 
 @runtime_checkable
 class OfState(Sensor, Protocol):
     """A sensor that measures its own robot: `views` is POSE, CHANGE or TWIST.
+
+    Or any blocks of the map: `views` is BLOCKS or PLACES, and `expect(*x)` returns the expectation (m,) from the means
+    of the blocks (as `Slam.mean` has them), or from their places (d,), alone or as (e, E_1, ..., E_k) with its
+    Jacobians in the errors of each.  docs/factors.md.
 
     >>> km.sensors.Heading().views, km.sensors.Odometer2D().views, km.sensors.Gyro2D().views
     ('pose', 'change', 'twist')
@@ -432,6 +442,16 @@ class OfState(Sensor, Protocol):
     views: str
     pass_share: float
     """The share of good readings that pass its gate."""
+
+
+def measures_blocks(sensor: object) -> bool:
+    """Return whether a sensor measures any robots and landmarks, which each observation names."""
+    return isinstance(sensor, OfState) and sensor.views in (BLOCKS, PLACES)
+
+
+def with_jacobians(expected: Any) -> tuple[Any, ...]:
+    """Return an expectation e (m,), and its Jacobians if `expect` of a sensor of blocks returned them behind it."""
+    return expected if isinstance(expected, tuple) and np.ndim(expected[0]) else (expected,)
 
 
 def poses_kept(sensor: OfState) -> int:
@@ -720,8 +740,9 @@ def refuse_other_views(sensor: object, what: str) -> None:
     if not hasattr(sensor, "views"):
         return
     name = type(sensor).__name__
-    if sensor.views not in (POSE, CHANGE, TWIST):
-        raise ModelError(f"{what}: {name}.views is {sensor.views!r}, expected {POSE!r}, {CHANGE!r} or {TWIST!r}")
+    views = POSE, CHANGE, TWIST, BLOCKS, PLACES
+    if sensor.views not in views:
+        raise ModelError(f"{what}: {name}.views is {sensor.views!r}, expected one of {', '.join(map(repr, views))}")
     if not hasattr(sensor, "pass_share"):
         raise ModelError(f"{what}: {name} has views and no pass_share, expected the share of good readings that pass")
 

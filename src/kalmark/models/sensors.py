@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from kalmark.declare import built_in
-from kalmark.models import doppler, radio, state_sensors, planar, spatial, imaging
+from kalmark.models import blocks, doppler, radio, state_sensors, planar, spatial, imaging
+from kalmark.models.blocks import *
 from kalmark.models.doppler import *
 from kalmark.models.radio import *
 from kalmark.models.state_sensors import *
@@ -12,6 +13,14 @@ from kalmark.models.planar import *
 from kalmark.models.spatial import *
 from kalmark.models.imaging import *
 
-__all__ = doppler.__all__ + imaging.__all__ + planar.__all__ + radio.__all__ + spatial.__all__ + state_sensors.__all__
+__all__ = (
+    blocks.__all__
+    + doppler.__all__
+    + imaging.__all__
+    + planar.__all__
+    + radio.__all__
+    + spatial.__all__
+    + state_sensors.__all__
+)
 
 BUILT_IN = built_in("sensor")  # those of landmarks and those of the state

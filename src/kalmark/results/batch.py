@@ -24,7 +24,7 @@ from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.logs.progress import track
 from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
-from kalmark.models.protocols import Landmark, OfState, SeesVelocity
+from kalmark.models.protocols import Landmark, OfState, SeesVelocity, measures_blocks
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import corners
 from kalmark.results.figure_texts import Figures
@@ -180,6 +180,8 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
         starts={start.robot: _start(start, again.get(start.robot)) for start in history.starts},
         fixes=len(run.history.fixes),
         left_out=rejected,
+        between=_between(history, slam, np.flatnonzero(placed)),
+        merged={name: ids.get(into, as_id(into)) for name, into in _merged(history).items()},
         carried={name: tuple(gap.start_ns for gap in history.carried(name)) for name in robots},
     )
 
@@ -251,12 +253,28 @@ def _of_places(history: History, slam: Slam, rows: Index) -> Index:
 
 def _in_the_end(history: History, rows: Index) -> list[str]:
     """Return the landmarks of observations as they are called in the end, after merges."""
+    now = _merged(history)
+    return [now.get(name, name) for name in history.landmark[rows].tolist()]
+
+
+def _merged(history: History) -> dict[str, str]:
+    """Return how landmarks that were merged are called in the end."""
     now: dict[str, str] = {}
     for change in history.changes:
         if change.what == "merged":
             now = {one: change.into if other == change.landmark else other for one, other in now.items()}
             now[change.landmark] = change.into
-    return [now.get(name, name) for name in history.landmark[rows].tolist()]
+    return now
+
+
+def _between(history: History, slam: Slam, rows: Index) -> frozenset[tuple[int, str, str, int]]:
+    """Return those rows of the history that are of sensors of blocks: time in ns, robot, sensor and number."""
+    of = {key for key, mount in mounts_of(slam.robots).items() if measures_blocks(mount.sensor)}
+    if not of:
+        return frozenset()
+    steps = history.step[rows]
+    keys = (history.t_ns[steps], history.robot[steps], history.sensor[rows], history.index[rows])
+    return frozenset(key for key in zip(*(part.tolist() for part in keys), strict=True) if key[1:3] in of)
 
 
 def _point(slam: Slam) -> Landmark:

@@ -20,12 +20,15 @@ from kalmark.arrays import Array, Index
 from kalmark.compiled import python_form
 from kalmark.config.building import build_robot
 from kalmark.detect.laser_scan import RAW, Laser
-from kalmark.events import Control, Event, Id, Raw, Scan, seconds_text, sort_key
+from kalmark.errors import KalmarkError
+from kalmark.events import Control, Event, Id, Raw, Scan, list_names, seconds_text, sort_key
+from kalmark.geometry.angles import wrap
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import landmark_id
 from kalmark.models.observe import sensor_pose
 from kalmark.models.protocols import (
+    PLACES,
     POSE,
     Drifting,
     OfState,
@@ -33,12 +36,14 @@ from kalmark.models.protocols import (
     SeesVelocity,
     TimedNoise,
     coasts,
+    measures_blocks,
     parameter_covariance,
     poses_kept,
     range_limit,
     self_calibrating,
     tells_velocity,
     true_control,
+    with_jacobians,
 )
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.models.state_view import sees_state, velocity_of, view_of_state
@@ -51,7 +56,8 @@ from kalmark.slam.robot import Mount, Robot
 from kalmark.tracks.classes import Classes
 
 Key = tuple[int, str, str]
-Found = tuple[int, str, Array, list[Id | None] | None, tuple[Id | None, ...]]  # step, sensor, y, ids and origins
+# step, sensor, y, ids, or names of blocks, and origins
+Found = tuple[int, str, Array, list[Any] | None, tuple[Id | None, ...]]
 AT_ONCE = 2**14  # observations of landmarks, seen or not, that are made at once
 ROUNDS = 10  # of a fixed point: a constant changes a control by some percent
 WILD = 30.0  # by so many of its own errors an outlier of a sensor of the state is off
@@ -160,7 +166,8 @@ def simulation(world: World, seed: int | SeedSequence | Generator = 0) -> Simula
             for k, name, y, ids, real in sensor_scans(robot, robots, things, world, steps, chance):
                 t_ns = times[k] + round(robot.sensors[name].late_s * 1e9)
                 classes = reported_classes(robot.sensors[name], things[POINTS], real, chance)
-                events.append(Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y, ids=ids, classes=classes))
+                told: Any = {"of" if measures_blocks(robot.sensors[name].sensor) else "ids": ids}
+                events.append(Scan(t_ns=t_ns, robot=robot.name, sensor=name, y=y, classes=classes, **told))
                 origins[t_ns, robot.name, name] = real
             for name, carried in robot.sensors.items():
                 if carried.raw is not None:
@@ -346,6 +353,8 @@ def sensor_scans(
             y = laser.beams(carried.laser, carried.sensing, carried.frames[k], things, chance.sight)
             if len(y):
                 yield k, name, y, None, (None,) * len(y)
+        elif measures_blocks(carried.sensor):
+            yield from readings_between(robot, name, k, robots, things, chance)
         elif isinstance(carried.sensor, OfState):
             read, ids = reading(robot, carried, k, world.dt_s, chance), None
             if carried.sensing.loop_reach_m is not None:
@@ -431,6 +440,26 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
         carried.last = last if counts else carried.last
         return None
     return None if counts and last is None else y
+
+
+def readings_between(
+    robot: SimRobot, name: str, k: int, robots: list[SimRobot], things: dict[str, Things], chance: Chance
+) -> Iterator[Found]:
+    """Yield what a sensor of blocks measures at step k, if all of it is not left out."""
+    carried, y, of = robot.sensors[name], list[Array](), list[Any]()
+    sensor, d, there = carried.sensor, things[POINTS].dimensions, true_landmarks(things)
+    there |= {other.name: other.states[k, : d if sensor.views == PLACES else None] for other in robots}
+    for names in carried.sensing.between or ((robot.name,),):
+        if missing := {*names} - there.keys():
+            raise KalmarkError(f"simulation: the world has no {list_names(missing)}, expected names in it")
+        e = np.ravel(with_jacobians(sensor.expect(*(there[name] for name in names)))[0])
+        wild, told = chance.faults.uniform(size=2)
+        error = gaussian(sensor.noise(e[None])[0], chance.sight) * (WILD if wild < carried.sensing.outliers else 1.0)
+        if told >= (carried.sensing.dropouts or 0.0):
+            y.append(np.where(sensor.angular, wrap(e + error), e + error))
+            of.append(names)
+    if y:
+        yield k, name, np.array(y), of, (robot.name,) * len(y)
 
 
 def measure_state(carried: SimSensor, v: Array, since_s: float, chance: Chance) -> tuple[Array, float]:

@@ -24,7 +24,7 @@ from kalmark.geometry.angles import wrap
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import SE3
 from kalmark.models.landmarks import Point2D, Point3D
-from kalmark.models.protocols import StartNoise, range_limit, world_of
+from kalmark.models.protocols import StartNoise, in_view, range_limit, world_of
 from kalmark.models.sensors import Wall
 from kalmark.models.tags import corners, tag_seen_from
 from kalmark.models.walls import orient_segments
@@ -91,6 +91,8 @@ class SimulatedSensing(Section):
     """Probability that a measurement is false: of a place drawn from its field of view."""
     loop_reach_m: Positive | None = None
     """An `odometer` that keeps poses: read a scan against an earlier one, too, if the robot is so near to it again."""
+    between: Annotated[tuple[Annotated[tuple[int | str, ...], Field(strict=False)], ...], Field(strict=False)] = ()
+    """Of a sensor of blocks: the robots and landmarks of each of its observations; if empty its robot."""
     swapped: Annotated[tuple[Pair, ...], Field(strict=False)] = ()
     """Pairs of ids that are taken for each other."""
     hidden: Annotated[tuple[int, ...], Field(strict=False)] = ()
@@ -218,7 +220,7 @@ def exact_measurements(sensor: Any, v: Array, sizes: Array) -> tuple[Flags, Arra
         return seen
     if sort == TAGS:
         return tags_seen(sensor, v, sizes)
-    inside = sensor.sees(v)
+    inside = in_view(sensor, v)
     e = np.full((len(v), len(sensor.columns)), np.nan)
     if inside.any():
         e[inside] = sensor.expect(v[inside])[0]

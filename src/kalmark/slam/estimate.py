@@ -135,8 +135,8 @@ class Estimate:
         `in_view` of those in view alone.  Robots may be among the `names`.  A robot that lags is where it was (`lags`).
         Nothing changes.  Raises MapError.
         """
-        if (robot, sensor) in self.state.readers:
-            raise MapError(f"sensor {sensor!r} of {robot!r} measures its robot, expected one of landmarks")
+        if (robot, sensor) in self.state.readers or (robot, sensor) in self.state.of_blocks:
+            raise MapError(f"sensor {sensor!r} of {robot!r} measures no landmarks, expected one of landmarks")
         if (robot, sensor) not in self.state.channels:
             known = ", ".join(f"{r!r} {s!r}" for r, s in self.state.channels) or "none"
             raise MapError(f"robot {robot!r} has no sensor {sensor!r}, expected one of: {known}")

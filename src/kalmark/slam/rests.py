@@ -27,7 +27,7 @@ from kalmark.arrays import Array
 from kalmark.errors import ModelError
 from kalmark.events import Control, Event, Raw, Scan
 from kalmark.geometry.gaussian import gate
-from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState, TimedNoise, coasts
+from kalmark.models.protocols import CHANGE, POSE, TWIST, OfState, TimedNoise, coasts, measures_blocks
 from kalmark.models.state_sensors import ZeroVelocity2D, ZeroVelocity3D
 from kalmark.slam.held_control import control_covariance
 from kalmark.slam.robot import Robot
@@ -196,7 +196,7 @@ def sources_of(robot: Robot) -> list[WatchedSensor]:
         found.append((CONTROLS, None, tuple(motion.columns), not motion.held))
     for name, mount in robot.sensors.items():
         own = mount.sensor
-        if isinstance(own, OfState) and not isinstance(own, ZERO):
+        if isinstance(own, OfState) and not isinstance(own, ZERO) and not measures_blocks(own):
             found.append((name, own, tuple(own.columns), own.views == CHANGE))
     sources = []
     for name, sensor, columns, per_s in found:

@@ -60,7 +60,7 @@ from kalmark.slam.checks import (
 from kalmark.slam.checks import check_numbers as checked_numbers
 from kalmark.slam.correcting import correct, correct_by_known
 from kalmark.slam.estimate import Estimate
-from kalmark.slam.factors import correct_by_factor, factor_of
+from kalmark.slam.factors import correct_by_blocks, correct_by_factor, factor_of
 from kalmark.slam.held_readings import record_repeated_reading
 from kalmark.slam.policy import Policy, refuse_other_world
 from kalmark.slam.relocation_by_fixes import NEEDED
@@ -205,6 +205,8 @@ class Slam(Estimate):
         key = event.robot, event.sensor
         if key in state.readers:
             return state_corrections.correct_by_reading(state, event, state.readers[key])
+        if key in state.of_blocks:
+            return correct_by_blocks(state, event, state.of_blocks[key])
         policy = self._policy(event)
         return self._found(event if policy.detector is None else policy.detector(event))
 
@@ -458,7 +460,7 @@ class Slam(Estimate):
         >>> float(np.linalg.norm(slam.mean("door") - slam.mean("mast")).round(2))
         3.95
         """
-        done = correct_by_factor(self.state, factor_of(names, expect, y, cov, angular), gate)
+        done, _ = correct_by_factor(self.state, factor_of(names, expect, y, cov, angular), gate)
         self.state.settle()
         return done
 

@@ -18,7 +18,7 @@ from kalmark.filter.map import Map, StochasticMap
 from kalmark.filter.maps import MOST, CostBalance, compress_map, new_map
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import CAREFUL, Upkeep
-from kalmark.models.protocols import Landmark, OfState, world_of
+from kalmark.models.protocols import Landmark, OfState, measures_blocks, world_of
 from kalmark.slam.checks import check_covariance, fault_of, instance, refuse_odd_association, require_methods
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
@@ -112,6 +112,7 @@ class State:
         self.clones, self.surveys, self.given, self.pose_hypotheses, self.sums = Clones(), Surveys(), {}, {}, {}
         self.evidence = {}
         self.moving, self.sources, self.readers = {}, {}, {}
+        self.of_blocks: dict[ChannelKey, Any] = {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
         self.standing: dict[str, str] = {}
@@ -159,6 +160,9 @@ class State:
                 self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
             if isinstance(mount.sensor, OfState):
                 refuse_other_world(self.robots, type(mount.sensor).__name__, world_of(mount.sensor))
+                if measures_blocks(mount.sensor):
+                    self.of_blocks[robot.name, name] = mount.sensor
+                    continue
                 standing = rest_detector(mount.sensor, robot)
                 if standing is not None:
                     self.standing[robot.name] = name

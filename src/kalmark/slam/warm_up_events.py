@@ -27,6 +27,7 @@ from kalmark.models.protocols import (
     OfState,
     Reparametrizable,
     SeesVelocity,
+    measures_blocks,
     sample_segments,
 )
 from kalmark.slam.estimate import Estimate
@@ -160,14 +161,14 @@ def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Ite
     `pose` gives where a robot's sensor, both by name, is at the time of the call, (3,) or (7,).
     """
     robots, t_s = list(robots), 0.0
-    mounts = {(robot.name, name): mount for robot in robots for name, mount in robot.sensors.items()}
+    mounts = rehearsed_mounts(robots)
     readings = {key: _reading(m.sensor, len(m.at)) for key, m in mounts.items() if isinstance(m.sensor, OfState)}
     scenes = {key: _Scene(mount, pose(*key)) for key, mount in mounts.items() if key not in readings}
     for k in range(ROUNDS):
         for robot in robots:
             t_s += STEP_S
             yield Control(t_s, robot.name, np.full(len(robot.motion.columns), MOVING))
-            for name in robot.sensors:
+            for _, name in (key for key in mounts if key[0] == robot.name):
                 if (robot.name, name) in readings:
                     t_s += STEP_S
                     yield Scan(t_s, robot.name, name, readings[robot.name, name])
@@ -179,6 +180,12 @@ def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Ite
             if k == ROUNDS - 2:
                 size = 2 if robot.motion.space.axes == 1 else 3
                 yield Fix(t_s, robot.name, np.asarray(robot.start)[:size], np.eye(size))
+
+
+def rehearsed_mounts(robots: Iterable[Robot]) -> dict[ChannelKey, Mount]:
+    """Return the mounts of robots by their names, but those of sensors of blocks, which compile nothing."""
+    every = {(robot.name, name): mount for robot in robots for name, mount in robot.sensors.items()}
+    return {key: mount for key, mount in every.items() if not measures_blocks(mount.sensor)}
 
 
 def _reading(sensor: Any, pose: int) -> Array:

@@ -149,7 +149,7 @@ def visible_landmarks(
         in_view, y = sensor.sees_segments(T, np.ascontiguousarray(p[:, 0]), np.ascontiguousarray(p[:, 1]))
         return Looked(in_view, ["" if seen else "no part of its segment is in view" for seen in in_view], y)
     v = landmarks_in_frame(model.landmark, T, l)
-    in_view = sensor.sees(v) if isinstance(sensor, protocols.Visible) else np.ones(len(v), dtype=np.bool_)
+    in_view = protocols.in_view(sensor, v)
     why = [""] * len(v)
     for i in np.flatnonzero(~in_view).tolist() if reasons else ():
         why[i] = _out_of_view(sensor, v[i])
