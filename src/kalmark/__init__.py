@@ -17,6 +17,8 @@ from kalmark.errors import KalmarkError
 from kalmark.plugins import name_of_plugin, names_with_plugins
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from kalmark import association, detect, geometry
     from kalmark.declare import register
     from kalmark.events import Control, Fix, Frame, Scan
@@ -85,7 +87,16 @@ def __getattr__(name: str) -> Any:
     else:
         module: Any = import_module(home)
         globals()[name] = module if name in _MODULES else vars(module)[name]
+        if name == "Slam":
+            globals()[name].from_config = staticmethod(_slam_from_config)
     return globals()[name]
+
+
+def _slam_from_config(path: str | Path) -> Slam:
+    """Build the Slam that a configuration (a path or a shipped name) describes."""
+    from kalmark.config import slam_from_config
+
+    return slam_from_config(path)
 
 
 def __dir__() -> list[str]:

@@ -437,12 +437,16 @@ def class_of(role: str, name: str, world: str = "") -> type:
 def classes_of(role: str, name: str, world: str = "") -> list[type]:
     """Return the classes of a name, of a world or, for "", of all; plug-ins are loaded if the core has none.
 
+    file.py:Class, which a plugin of the user's has, is registered under this name.
+
     Raises KeyError if no class has this name.
     """
     if not _fitting(role, name, world):
         missing_models()
     if name not in _CLASSES.get(role, {}):
-        raise KeyError(name)
+        if (model := class_of_file(name)) is None:
+            raise KeyError(name)
+        register(role, name)(model)
     return _fitting(role, name, world)
 
 
@@ -514,14 +518,6 @@ def class_of_file(name: str) -> type | None:
         if place in (file.stem, file.name, str(file)) and isinstance(model := vars(module).get(attribute), type):
             return model
     return None
-
-
-def register_by_file(role: str, name: str) -> bool:
-    """Register file.py:Class under this name if a plugin has it, and return whether one has."""
-    model = class_of_file(name)
-    if model is not None:
-        register(role, name)(model)
-    return model is not None
 
 
 def line_of_error(error: BaseException) -> str:

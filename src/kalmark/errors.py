@@ -29,7 +29,11 @@ class KalmarkError(Exception):
     ... except km.KalmarkError as error:
     ...     print(error)
     'nobody' is not in the map, expected 'rover' or one of its 0 landmarks
+
+    `path` has the keys that lead to what is wrong in a description of a Slam.
     """
+
+    path: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return one_line(super().__str__())

@@ -16,7 +16,7 @@ import pytest
 
 import kalmark as km
 from kalmark.cli import main
-from kalmark.config import build_slam, load_config, open_run, slam_described
+from kalmark.config import build_slam, load_config, open_run
 from kalmark.config.sections import Choice, model_of
 from kalmark.declare import Parameter, built_in, class_of, declared_options, parameters, world_of_class
 from kalmark.errors import ConfigError, KalmarkError, MapError, ModelError
@@ -184,7 +184,7 @@ def test_a_readable_key_that_does_not_fit_the_exact_one_is_refused(tmp_path: Pat
         with pytest.raises(
             ConfigError, match=rf"robots.r.start.{key}: got 7.0, expected .* by its .*{what}.*, or none"
         ):
-            slam_described(load_config(path, [f"robots.r.start.{key}=7.0"]).model_dump(exclude_unset=True))
+            build_slam(load_config(path, [f"robots.r.start.{key}=7.0"]))
 
 
 def write_log(folder: Path, robots: dict[str, list[str]], columns: dict[str, tuple[str, ...]]) -> None:

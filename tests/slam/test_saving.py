@@ -374,10 +374,10 @@ TABLES: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]
         lambda d, _: d["tracks"]["candidates"].append([["a", "nose"], []]),
         "that there are not",
     ),
-    "no robots": (lambda _, s: s.update(robots=[]), "settings: robots: got .., expected a mapping"),
+    "no robots": (lambda _, s: s.update(robots=[]), "no attribute 'items', expected a map written by save"),
     "another model": (
         lambda _, s: s["estimator"].update(type="StochasticMap"),
-        "estimator.type: got .*, expected one of ekf",
+        "estimator: type: got .*, expected one of ekf",
     ),
     "a time that is none": (lambda d, _: d.update(t_ns="now"), "t_ns is 'now'"),
     "a missing table": (lambda d, _: d["tracks"].pop("recent"), "KeyError: 'recent', expected a map written by save"),

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
-from kalmark.arrays import Array
 from kalmark.config.opening import known_map_path, open_run, with_log_description
-from kalmark.config.reading import did_you_mean, load_config, one_near, validate
+from kalmark.config.reading import did_you_mean, load_config, one_near
 from kalmark.config.schema import TRUTH, Config, SpaceStartConfig
-from kalmark.config.sections import ModelSection, model_of
-from kalmark.config.tree import EACH, KeyPath, Tree, quote_value
+from kalmark.config.sections import model_of, plain_section
+from kalmark.config.tree import EACH, KeyPath, quote_value
 from kalmark.config.true_start import true_start
-from kalmark.declare import built_in, declared_options, registered_name
+from kalmark.declare import built_in, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Control, Raw, Scan
-from kalmark.geometry.named_poses import pose_of, world_of
+from kalmark.geometry.named_poses import world_of
 from kalmark.logs.formats import known_formats
 from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
 from kalmark.logs.log import Log
@@ -32,10 +30,9 @@ from kalmark.models.protocols import Motion as MotionModel
 from kalmark.models.protocols import state_columns
 from kalmark.picture_options import USUAL, Picture
 from kalmark.plugins import load_all
-from kalmark.slam.description import EXACT, covariance_of, describe_place, state_of
+from kalmark.slam.description import EXACT, arguments_of, describe_place, place_described, robot_described
 from kalmark.slam.robot import Mount, Robot
 from kalmark.slam.slam import Slam
-from kalmark.slam.state import Settings
 
 BY_SIGMAS = "state a start without at_rest, as uncertain as it is: sigma_rotation_deg, sigma_v_mps, sigma_bias_..."
 
@@ -54,25 +51,18 @@ def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
     <Slam of 'robot' before its first event: 0 landmarks, Invariant, ByIdentity>
     """
     config = config if log is None else with_log_description(config, log)
+    made, m = partial(_made, config), config.map
     robots = given.pop("robots", None) or [build_robot(config, name, log) for name in _names(config, log)]
-    m = config.map
-    linear = None if m.reparametrize == "off" else m.reparametrize
-    kept = {"map": m.type, "numbers": m.numbers, "reparametrize": linear}
-    for each in fields(Settings):
-        if each.name not in (*kept, *given):
-            made = _part(config, (each.name,), getattr(config, each.name), robots[0].motion.space.world)
-            kept[each.name] = made
-    slam: Slam = _made(config, ("robots",), Slam, robots, **kept, **given)
+    slam: Slam = made(("robots",), Slam, **made((), arguments_of, plain_section(config), robots=robots, **given))
     world = robots[0].motion.space.world
     for name, mean, cov, columns in _known(config, log):
         high = PointHeight2D() if columns == HIGH and world == "plane" else None
-        _made(config, ("map", "known"), slam.add_landmark, name, mean, cov, high)
+        made(("map", "known"), slam.add_landmark, name, mean, cov, high)
     for k, known in enumerate(m.landmarks):
         at = ("map", "landmarks", str(k))
-        model = _part(config, (*at, "landmark"), known.landmark, world)
-        _made(config, at, slam.add_landmark, known.id, known.mean, known.cov, model)
+        made(at, slam.add_landmark, known.id, known.mean, known.cov, model_of(known.landmark, world))
     if m.cov is not None:
-        _made(config, ("map", "cov"), slam.state.set_covariance, m.cov)
+        made(("map", "cov"), slam.state.set_covariance, m.cov)
     return slam
 
 
@@ -102,18 +92,6 @@ def slam_from_config(path_or_name: str | Path) -> Slam:
     return build_slam(config) if config.log.path is None else build_slam(*open_run(path_or_name))
 
 
-def slam_described(said: dict[str, Any], **given: Any) -> Slam:
-    """Return the filter that `kalmark.slam.description.describe` describes, with models `given` for some of it.
-
-    >>> from kalmark.slam.description import describe
-    >>> rover = km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing())})
-    >>> slam_described(describe(km.Slam(rover)))
-    <Slam of 'rover' before its first event: 0 landmarks, Invariant, ByIdentity>
-    """
-    kept = {key: value for key, value in said.items() if key not in given}
-    return build_slam(validate(Tree(kept, places={(): "settings"}), Config), **given)
-
-
 def build_picture(config: Config, robots: Iterable[str]) -> Picture:
     """Return the options of pictures that a configuration has, of these robots.
 
@@ -138,16 +116,7 @@ def config_dict(config: Config) -> dict[str, Any]:
     >>> config_dict(load_config("native"))["estimator"]["type"]
     'invariant'
     """
-    return dict(_plain(config))
-
-
-def _plain(value: Any) -> Any:
-    """Return sections as mappings; a key without value only where the user wrote it, to undo what the log describes."""
-    if isinstance(value, BaseModel):
-        return {n: _plain(v) for n, v in value if v is not None or n in value.model_fields_set}
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
+    return dict(plain_section(config))
 
 
 def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
@@ -162,21 +131,16 @@ def build_robot(config: Config, name: str, log: Log | None = None) -> Robot:
     moves = _made(config, (*path, "motion"), model_of, robot.motion)
     if log is not None:
         refuse_controls(config, key, name, moves.columns, log)
-    start, cov = _start(config, (*path, "start"), robot.start, name, log, moves)
-    rests: dict[str, Any] = {}
-    if isinstance(robot.start, SpaceStartConfig) and robot.start.at_rest:
-        start, cov, rests["rests_until_ns"] = _made(
-            config, (*path, "start"), _start_at_rest, moves, name, log, start, cov
-        )
-    world = moves.space.world
-    mounts = {s: _mount(config, (*path, "sensors", s), sensor, world) for s, sensor in robot.sensors.items()}
+    own = _start(config, (*path, "start"), robot.start, name, log, moves)
+    found = _made(config, path, robot_described, name, plain_section(robot), **own)
+    for s, mount in found.sensors.items():
+        _refuse_odd_mount(config, (*path, "sensors", s), robot.sensors[s], mount)
     if log is not None:
-        refuse_scans(config, key, name, mounts, log)
+        refuse_scans(config, key, name, found.sensors, log)
         if any(isinstance(event, Raw) and event.robot == name for event in log.events):
             for check in load_all("checks")[0].values():
                 check(config, key, name, log)
-    own = {each.name: getattr(robot, each.name) for each in declared_options(Robot)} | rests | {"motion": moves}
-    return _made(config, path, Robot, name, start=start, sensors=mounts, cov=cov, **own)
+    return found
 
 
 def _names(config: Config, log: Log | None) -> list[str]:
@@ -193,22 +157,23 @@ def _names(config: Config, log: Log | None) -> list[str]:
 
 def _start(
     config: Config, path: KeyPath, section: Any, name: str, log: Log | None, moves: MotionModel
-) -> tuple[Any, Any]:
-    """Return the start and its covariance: as configured, else by the truth, else the origin."""
-    if section is not None:
-        return _placed(config, path, section, moves.space.dof, state_columns(moves))
-    return (None, None) if log is None else true_start(log, name, moves)
+) -> dict[str, Any]:
+    """Return the start of a robot and its covariance: as configured, else by the truth, else the origin."""
+    if section is None:
+        start, cov = (None, None) if log is None else true_start(log, name, moves)
+        return {"start": start, "cov": cov}
+    behind = state_columns(moves)
+    at, cov = place_described(vars(section), moves.space.dof, behind)
+    _refuse_contradiction(config, path, section, at, cov, behind)
+    at_rest = isinstance(section, SpaceStartConfig) and section.at_rest
+    return _made(config, path, _start_at_rest, moves, name, log, at, cov) if at_rest else {"start": at, "cov": cov}
 
 
-def _placed(
-    config: Config, path: KeyPath, section: Any, dof: int, behind: KeyPath = ()
-) -> tuple[list[float], Array | None]:
-    """Return where a section places a mount or a start, with its state, and the covariance.
-
-    Raises ConfigError where one of its exact keys contradicts the readable ones beside it.
-    """
+def _refuse_contradiction(
+    config: Config, path: KeyPath, section: Any, at: Any, cov: Any, behind: KeyPath = ()
+) -> None:  # fmt: skip
+    """Refuse a mount or a start, at a pose with a covariance, whose exact keys contradict the readable ones."""
     said = vars(section)
-    at, cov = [*pose_of(said), *state_of(said, behind)], covariance_of(said, dof, behind)
     exact = [key for key in EXACT if said.get(key) is not None]
     told = describe_place(at, world_of(said), cov, behind) if exact else {}
     for key in (section.model_fields_set & told.keys()) - {*EXACT}:
@@ -218,11 +183,10 @@ def _placed(
                 f"got {quote_value(said[key])}, expected {quote_value(told[key])} by its {' and '.join(exact)}, "
                 "or none of these beside it",
             )
-    return at, cov
 
 
-def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any) -> tuple[Array, Array, int]:
-    """Return the start of a robot whose log begins at rest, its covariance, and until when (ns) it does.
+def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov: Any) -> dict[str, Any]:
+    """Return the start of a robot whose log begins at rest, its covariance, and until when it does.
 
     Raises ModelError.
     """
@@ -238,25 +202,17 @@ def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov
         found = start_at_rest(motion, seconds, u, np.array(start, dtype=np.float64), np.asarray(cov, dtype=np.float64))
     except ModelError as error:
         raise ModelError(f"{error}. Begin where it stands, by log.from_s; or {BY_SIGMAS}") from None
-    return found.start, found.cov, int(t_ns[0]) + round(found.until_s * 1e9)
+    until_ns = int(t_ns[0]) + round(found.until_s * 1e9)
+    return {"start": found.start, "cov": found.cov, "rests_until_ns": until_ns}
 
 
-def _mount(config: Config, path: KeyPath, sensor: Any, world: str) -> Mount:
-    own = {each.name: getattr(sensor, each.name) for each in declared_options(Mount)}
-    if sensor.initialization.type == "immediate":
-        del own["initialization"]
-    parts = {name: _part(config, (*path, name), part, world) for name, part in own.items() if part is not None}
-    model = _made(config, path, model_of, sensor, world)
-    if world == "plane" and sensor.mount.z_m and not isinstance(model, Raised):
-        what = f"got {sensor.mount.z_m:g}, expected none: a {sensor.type} measures in the plane"
-        raise config.error((*path, "mount", "z_m"), what)
-    at, cov = _placed(config, (*path, "mount"), sensor.mount, 3 if world == "plane" else 6)
-    return _made(config, path, Mount, model, at=at, cov=cov, **parts)
-
-
-def _part(config: Config, path: KeyPath, value: Any, world: str) -> Any:
-    """Return the model that a section describes, or a value that is none."""
-    return _made(config, path, model_of, value, world) if isinstance(value, ModelSection) else value
+def _refuse_odd_mount(config: Config, path: KeyPath, section: Any, mount: Mount) -> None:
+    """Refuse a height of a sensor that has none, and exact keys of a mount that contradict the readable ones."""
+    place, path = section.mount, (*path, "mount")
+    if world_of(vars(place)) == "plane" and place.z_m and not isinstance(mount.sensor, Raised):
+        what = f"got {place.z_m:g}, expected none: a {section.type} measures in the plane"
+        raise config.error((*path, "z_m"), what)
+    _refuse_contradiction(config, path, place, mount.at, mount.cov)
 
 
 def _made(config: Config, path: KeyPath, make: Callable[..., Any], *args: Any, **keys: Any) -> Any:
@@ -264,7 +220,7 @@ def _made(config: Config, path: KeyPath, make: Callable[..., Any], *args: Any, *
     try:
         return make(*args, **keys)
     except (ModelError, LogError, MapError) as error:
-        raise config.error(path, str(error)) from None
+        raise config.error((*path, *error.path), str(error)) from None
 
 
 def refuse_controls(config: Config, key: str, name: str, columns: KeyPath, log: Log) -> None:
@@ -275,7 +231,7 @@ def refuse_controls(config: Config, key: str, name: str, columns: KeyPath, log: 
         raise _other_columns(log, name, "", given, wanted, _fitting("motion", given), f"{key}.motion", columns)
 
 
-def refuse_scans(config: Config, key: str, name: str, mounts: dict[str, Mount], log: Log) -> None:
+def refuse_scans(config: Config, key: str, name: str, mounts: Mapping[str, Mount], log: Log) -> None:
     """Refuse observations that a sensor does not take and, unless bad input is skipped, sensors not configured."""
     for (robot, sensor), given in log.sensor_columns.items():
         if robot != name or sensor not in mounts or not isinstance(mounts[sensor].detector, Laser | None):

@@ -15,18 +15,8 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, create_model, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-import kalmark.association
-import kalmark.detect
-import kalmark.filter.estimators
-import kalmark.management.attention
-import kalmark.management.initialization
-import kalmark.management.upkeep
-import kalmark.models.landmarks
-import kalmark.models.motion
-import kalmark.models.sensors  # noqa: F401 - all of these register their models
 from kalmark.declare import (
     Parameter,
-    class_of,
     classes,
     classes_of,
     has_one_model,
@@ -34,13 +24,13 @@ from kalmark.declare import (
     missing_models,
     parameters,
     plugin_of,
-    register_by_file,
     summary,
     world_of_class,
 )
 from kalmark.errors import EventError, ModelError
 from kalmark.events import MOST, Id, checked_id, is_number
 from kalmark.plugins import entry_points_of, load
+from kalmark.slam.description import model_described
 from kalmark.slam.sources import finds
 
 FAR = MOST["m"]
@@ -160,7 +150,7 @@ class Choice:
         try:
             models = classes_of(self.role, name, self.world)
         except KeyError:
-            return register_by_file(self.role, name)
+            return False
         return bool(models) and (self.sensor is None or finds(models[0], self.sensor))
 
     def made(self, name: str, value: Any) -> Section:
@@ -299,18 +289,20 @@ def model_of(section: Any, world: str = "plane") -> Any:
     """
     if section is None:
         return None
-    model = class_of(section.of_role, section.of_name, section.of_world or world)
-    given = {own.name: getattr(section, own.name) for own in parameters(model)}
-    optional = {own.name for own in parameters(model) if own.optional and own.name in section.model_fields_set}
-    try:
-        return model(**{name: value for name, value in given.items() if value is not None or name in optional})
-    except TypeError as error:
-        raise ModelError(f"{section.of_name} cannot be made of the keys of its section: {error}") from None
+    return model_described(section.of_role, plain_section(section), section.of_world or world)
+
+
+def plain_section(value: Any) -> Any:
+    """Return sections as mappings; a key without value only where the user wrote it, to undo what the log describes."""
+    if isinstance(value, BaseModel):
+        return {n: plain_section(v) for n, v in value if v is not None or n in value.model_fields_set}
+    if isinstance(value, dict):
+        return {key: plain_section(item) for key, item in value.items()}
+    return [plain_section(item) for item in value] if isinstance(value, tuple) else value
 
 
 def _unpickled(role: str, name: str, world: str, plugin: Path | None) -> Section:
     if plugin is not None:
         load_plugin(plugin)
-        register_by_file(role, name)
     section = section_of(role, name, world)
     return section.__new__(section)

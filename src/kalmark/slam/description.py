@@ -9,20 +9,36 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 
+import kalmark.detect
+import kalmark.management.initialization
+import kalmark.models.landmarks
+import kalmark.models.motion
+import kalmark.models.sensors  # noqa: F401 - all of these register their models
 from kalmark.arrays import Array
-from kalmark.declare import declared_options, has_one_model, own_name, parameters, registered_name
-from kalmark.events import Id
+from kalmark.declare import (
+    class_of,
+    classes,
+    declared_options,
+    has_one_model,
+    own_name,
+    parameters,
+    registered_name,
+)
+from kalmark.errors import KalmarkError, ModelError
+from kalmark.events import Id, short_text
 from kalmark.geometry.named_poses import describe_pose, pose_of, world_of
 from kalmark.models.landmark_views import Raised
 from kalmark.models.protocols import state_columns
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.robot import Mount, Robot
+from kalmark.slam.state import Settings
 
 Description = dict[str, Any]
 
@@ -41,6 +57,7 @@ SIGMAS = {
 }
 """The keys of the sigmas of a pose and their axes."""
 EXACT = ("quaternion", "state", "cov")
+NONE = (None, {"type": "immediate"})  # parts of a mount that are not there
 _AXIS = re.compile(r"(?:_|(?<=[vwa]))[xyz](?=_)")  # of a key: vx_mps, gravity_x_mps2
 
 
@@ -99,6 +116,90 @@ def describe_model(value: Any) -> Description:
     return given if has_one_model(name) else {"type": name} | given
 
 
+# ---------------------------------------------------------------------- and back
+@contextmanager
+def part(*path: str) -> Iterator[None]:
+    """Add the keys that lead to a part of a description to the errors of that part."""
+    try:
+        yield
+    except KalmarkError as error:
+        error.path = (*path, *error.path)
+        raise
+
+
+def arguments_of(said: Description, **given: Any) -> Description:
+    """Return the arguments of the Slam that `describe` describes, some of them `given` instead.
+
+    Raises ModelError with the `path` of the part that cannot be made.
+    """
+    robots = given.get("robots") or [robot_described(name, each) for name, each in said["robots"].items()]
+    storage = said["map"]
+    kept = said | {"map": storage["type"], "numbers": storage["numbers"], "reparametrize": storage["reparametrize"]}
+    own = {key: value for key, value in kept.items() if key not in given and value != "off"}
+    parts = {"reparametrize": None} | _options(Settings, own, robots[0].motion.space.world)
+    return parts | given | {"robots": robots}
+
+
+def robot_described(name: str, said: Description, **own: Any) -> Robot:
+    """Return a robot that is described; `own` are arguments in the place of those described.  Raises ModelError."""
+    own = _options(Robot, said) | own
+    space, behind = own["motion"].space, state_columns(own["motion"])
+    if "start" not in own:
+        own["start"], own["cov"] = place_described(said["start"], space.dof, behind)
+    sensors = {}
+    for key, each in said["sensors"].items():
+        with part("sensors", key):
+            model = model_described("sensor", each, space.world)
+            at, cov = place_described(each["mount"], 3 if space.world == "plane" else 6)
+            sensors[key] = Mount(model, at=at, cov=cov, **_options(Mount, each, space.world))
+    return Robot(name, sensors=sensors, **own)
+
+
+def _options(of: type, said: Description, world: str = "") -> Description:
+    """Return the options of a class that are described, models made."""
+    out = {each.name: said[each.name] for each in declared_options(of) if said.get(each.name) not in NONE}
+    for each in declared_options(of):
+        if each.role and each.name in out:
+            with part(each.name):
+                out[each.name] = model_described(each.role, out[each.name], world)
+    return out
+
+
+def model_described(role: str, said: Mapping[str, Any], world: str = "") -> Any:
+    """Return the model that `describe_model` describes, of the plane or of space where its type leaves that open.
+
+    The height of a sensor of the plane is that of its `mount`.  Raises ModelError for a type that there is not, and if
+    the model refuses its parameters.
+    """
+    name = said.get("type", role)
+    try:
+        kind = class_of(role, name, world)
+    except KeyError:
+        got = f"got {short_text(name)}, expected one of {', '.join(classes(role, world))}"
+        raise ModelError(f"type: {got}") from None
+    if world == "plane" and "mount" in said:
+        said = {"height_m": said["mount"].get("z_m", 0.0), **said}
+    own = [each for each in parameters(kind) if each.name in said]
+    given = {each.name: said[each.name] for each in own if each.optional or said[each.name] is not None}
+    try:
+        return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in given.items()})
+    except TypeError as error:
+        raise ModelError(f"{name} cannot be made of the keys of its section: {error}") from None
+
+
+def place_described(
+    said: Mapping[str, Any], dof: int, behind: tuple[str, ...] = ()
+) -> tuple[list[float], Array | None]:
+    """Return the pose, with a whole state, of a mount or a start, and its covariance (dof, dof), None if it has none.
+
+    `behind` are the names of what the state has behind its pose.
+    """
+    names = state_names(behind, world_of(said))
+    state = said["state"] if said.get("state") is not None else [said[name] for name in names]
+    return [*pose_of(said), *state], covariance_of(said, dof, behind)
+
+
+# ---------------------------------------------------------------------- parts
 def _described(value: Any) -> Any:
     return (
         plain_value(value) if isinstance(value, bool | int | float | str | np.generic | None) else describe_model(value)
@@ -147,12 +248,6 @@ def describe_place(at: Any, world: str, cov: Any = None, behind: tuple[str, ...]
     if cov is not None and (found is None or not np.array_equal(found, P)):
         exact["cov"] = P.tolist()
     return said | exact
-
-
-def state_of(said: Mapping[str, Any], behind: tuple[str, ...]) -> list[float]:
-    """Return the components of a start's state after its pose; empty if it has none."""
-    names = state_names(behind, world_of(said))
-    return [said[name] for name in names] if said.get("state") is None else [*said["state"]]
 
 
 def covariance_of(said: Mapping[str, Any], dof: int, behind: tuple[str, ...] = ()) -> Array | None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.codec import NOT_FINITE, Reader, Writer, kind_of, place_in_record
-from kalmark.declare import class_of, class_of_file, classes
+from kalmark.declare import class_of_file, classes
 from kalmark.errors import KalmarkError, MapError
 from kalmark.events import Id
 from kalmark.files import refuse_bomb, replace_file
@@ -29,7 +29,7 @@ from kalmark.filter.maps import restore_map as restored_map
 from kalmark.geometry.spaces import SE2, SE3, Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
-from kalmark.slam.description import Description, describe, describe_model
+from kalmark.slam.description import Description, arguments_of, describe, describe_model, model_described
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.held_control import bias_block, bias_name
 from kalmark.slam.pose_hypothesis import motion_of_hypothesis
@@ -139,7 +139,7 @@ def errors(path: Path) -> Iterator[None]:
     try:
         yield
     except KalmarkError as error:
-        raise MapError(f"{path}: {error}") from error
+        raise MapError(": ".join([str(path), *filter(None, [".".join(error.path)]), str(error)])) from error
     except OSError as error:
         said = error.strerror or error
         raise MapError(f"{path}: {said}, expected a map written by save()") from error
@@ -149,7 +149,7 @@ def errors(path: Path) -> Iterator[None]:
 
 
 def load(path: Path, built: Callable[..., Any], robots: Iterable[Robot] | None, **models: Any) -> Any:
-    """Return the Slam of a file written by `save`, `built` by its description; a user's own models are given again.
+    """Return the Slam of a file written by `save`, `built` of its arguments; a user's own models are given again.
 
     Raises MapError if the file is damaged, lacks a model, or was saved with other robots or landmarks.
     """
@@ -171,7 +171,7 @@ def load(path: Path, built: Callable[..., Any], robots: Iterable[Robot] | None, 
         if robots is not None:
             given["robots"] = _same_robots([*robots], said["robots"])
         _refuse_own({name: each for name, each in said.items() if name not in given})
-        slam = built(said, **given)
+        slam = built(**arguments_of(said, **given))
         fill_state(slam.state, members, own)
         return slam
 
@@ -276,8 +276,7 @@ def _landmark(said: Description, own: Sequence[Landmark], world: str, what: str)
     like = [each for each in own if is_type(each, said)]
     found = next((each for each in like if _each(describe_model(each), _to_text) == said), None)
     if said["type"] in classes("landmark") and found is None:
-        given = {key: value for key, value in _each(said, _to_number).items() if key != "type"}
-        made: Landmark = class_of("landmark", said["type"], world)(**given)
+        made: Landmark = model_described("landmark", _each(said, _to_number), world)
         return made
     if not like:
         raise MapError(f"{what} is {_name(said)}, a model of your own: give the landmarks to load() again")

@@ -16,9 +16,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -94,6 +93,8 @@ class Slam(Estimate):
     >>> slam.covariance("rover", 7).shape
     (5, 5)
     """
+
+    from_config: ClassVar[Callable[[str | Path], Slam]]  # by `kalmark`: configuration stands above
 
     def __init__(
         self,
@@ -512,8 +513,7 @@ class Slam(Estimate):
         from kalmark.slam import saving
 
         own = {"association": association, "estimator": estimator, "landmarks": landmarks}
-        config = import_module("kalmark.config")  # by name: it stands above
-        loaded: Slam = saving.load(Path(path), config.slam_described, robots, **own)
+        loaded: Slam = saving.load(Path(path), Slam, robots, **own)
         return loaded
 
     def __reduce__(self) -> tuple[Callable[..., Slam], tuple[Any, ...]]:
@@ -521,11 +521,6 @@ class Slam(Estimate):
         from kalmark.slam import saving
 
         return _copied, ([*self.robots.values()], self.state.settings, saving.members_of(self.state, {}))
-
-    @staticmethod
-    def from_config(path: str | Path) -> Slam:
-        """Build the Slam that a configuration (a path or a shipped name) describes."""
-        return import_module("kalmark.config").slam_from_config(path)  # by name: configuration stands above
 
 
 def _copied(robots: list[Robot], settings: Settings, members: dict[str, bytes]) -> Slam:
