@@ -17,7 +17,7 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.geometry.gaussian import contours
 from kalmark.picture_options import Picture
-from kalmark.results.camera_images import Pictures
+from kalmark.results.camera_log import images_of_cameras
 from kalmark.results.explain import Explanation, Fate
 from kalmark.results.figure_texts import figure as figure_of
 from kalmark.results.history import Measuring
@@ -159,9 +159,9 @@ def draw_sensor(run: Recording, robot: str, sensor: str, step: int | None = None
     width = 9.0 if len(seen) == 1 else 14.0
     figure = Figure(figsize=(width, (width - 1.0) / len(seen) * shape + 1.5), layout="constrained", facecolor="white")
     grid = figure.subplots(1, len(seen), squeeze=False)[0]
-    pictures, options = Pictures(run), picture_of(run)
+    pictures, options = images_of_cameras(run), picture_of(run)
     for axes, image in zip(grid, seen, strict=True):
-        draw_image(axes, image, camera.size, options, pictures.at(camera, int(steps[-1]), image.side))
+        draw_image(axes, image, camera.size, options, pictures and pictures.at(camera, int(steps[-1]), image.side))
     title = scan_title(camera, history.t_s[steps[-1]], [s.outcome for s in seen[0].observations])
     add_title_and_legend(figure, title, legend(seen, options))
     return figure

@@ -25,7 +25,7 @@ from PIL import Image
 from kalmark.arrays import Array
 from kalmark.picture_options import Picture
 from kalmark.report import OUTCOMES
-from kalmark.results.camera_images import Pictures
+from kalmark.results.camera_log import images_of_cameras
 from kalmark.results.evaluate import headline, summary_of
 from kalmark.results.explain import Explanation, Fate, explain_step
 from kalmark.results.figure_texts import (
@@ -201,7 +201,7 @@ def read_page(name: str) -> str:
 
 def series(run: Recording, scene: Scene) -> Data:
     """Return all that the pictures of a report need; times in seconds since the first step."""
-    t, pictures = run.history.t_s, Pictures(run)
+    t, pictures = run.history.t_s, images_of_cameras(run)
     dof, maps = (3, 6)[scene.d - 2], run.history.maps
     stride = max(1, -(-sum(len(m.ids) for m in maps) // LANDMARKS))  # the page stays of a size to open
     maps = maps[::-1][::stride][::-1]  # the last among them
@@ -272,7 +272,7 @@ def correlation_image(correlations: Array) -> str:
 
 
 def _camera(
-    run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array, pictures: Pictures
+    run: Recording, camera: Camera, maps: Sequence[MapSnapshot], t: Array, pictures: Any
 ) -> Data:  # fmt: skip
     """Return the last images of a camera at the maps: `frames` are indices of its `scans`, None before the first."""
     steps, options = steps_of(run.history, camera), picture_of(run)
@@ -282,7 +282,7 @@ def _camera(
     for step in steps[used].tolist():
         seen = []
         for image in images(run.history, camera, step):
-            picture = pictures.uri(camera, step, image.side)
+            picture = pictures and pictures.uri(camera, step, image.side)
             seen.append({"side": image.side, "seen": [_seen(one, options) for one in image.observations]}
                         | ({"picture": picture} if picture else {}))  # fmt: skip
         scans.append({"t": round(float(t[step]), 3), "images": seen})

@@ -17,7 +17,7 @@ from PIL import Image
 from kalmark.errors import RunError
 from kalmark.files import replace_file
 from kalmark.logs.progress import track
-from kalmark.results.camera_images import Pictures
+from kalmark.results.camera_log import images_of_cameras
 from kalmark.results.evaluate import headline
 from kalmark.results.plot import VIEWS, Projection, draw_plan, draw_space
 from kalmark.results.plot_scan import draw_image
@@ -86,7 +86,7 @@ def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool, 
     """Yield one figure again and again, drawn again after each of the steps."""
     figure = Figure(figsize=INCHES, dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    t_s, title, pictures = run.history.t_s, headline(run)[0], Pictures(run)
+    t_s, title, pictures = run.history.t_s, headline(run)[0], images_of_cameras(run)
     for k, step in enumerate(track(steps, "video", len(steps), show=progress)):
         figure.clear()
         _draw(figure, run, Scene.of(run, step, world), step, orbit_deg * k / max(len(steps) - 1, 1), pictures)
@@ -95,7 +95,7 @@ def _frames(run: Recording, steps: list[int], orbit_deg: float, progress: bool, 
         yield figure
 
 
-def _draw(figure: Figure, run: Recording, scene: Scene, step: int, turned: float, pictures: Pictures) -> None:
+def _draw(figure: Figure, run: Recording, scene: Scene, step: int, turned: float, pictures: Any) -> None:
     if scene.d == 2:
         draw_plan(figure.add_axes((0.07, 0.09, 0.9, 0.84)), scene)
         return
@@ -114,7 +114,7 @@ def _draw(figure: Figure, run: Recording, scene: Scene, step: int, turned: float
         axes.set_title(title, fontsize=9, color="#555b66")
 
 
-def _last_images(run: Recording, step: int, pictures: Pictures) -> list[tuple[str, Any, tuple[float, float], Any]]:
+def _last_images(run: Recording, step: int, pictures: Any) -> list[tuple[str, Any, tuple[float, float], Any]]:
     """Return titles, what each camera saw last up to a step, the size of its image, and the image if there is one."""
     out: list[tuple[str, Any, tuple[float, float], Any]] = []
     for camera in run.history.cameras:
@@ -123,6 +123,6 @@ def _last_images(run: Recording, step: int, pictures: Pictures) -> list[tuple[st
             continue
         at = int(steps[steps <= step][-1])
         for image in images(run.history, camera, at):
-            picture = pictures.at(camera, at, image.side)
+            picture = pictures and pictures.at(camera, at, image.side)
             out.append((f"{camera.robot} · {camera.sensor} {image.side}", image, camera.size, picture))
     return out[:MOST_IMAGES]

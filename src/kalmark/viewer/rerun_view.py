@@ -17,7 +17,7 @@ from kalmark.logs.log import Log, poses_of_size
 from kalmark.logs.progress import track
 from kalmark.picture_options import Picture
 from kalmark.report import Report
-from kalmark.results.camera_images import Pictures
+from kalmark.results.camera_log import images_of_cameras
 from kalmark.results.filter_description import mount_now, observed_points
 from kalmark.results.filter_picture import scene_of_filter, truth_to_map
 from kalmark.results.history import WHOLE
@@ -102,7 +102,7 @@ def replay(run: Recording, save: Path | None = None) -> None:
     history, scene = run.history, Scene.of(run, world=True)
     scene = replace(scene, picture=_world(picture_of(run)), true_landmarks=run.truth.landmarks_in_map())
     scene = replace(scene, picture=light_colours(scene))
-    stream, pictures = Stream(run.log.name, scene, save), Pictures(run)
+    stream, pictures = Stream(run.log.name, scene, save), images_of_cameras(run)
     try:
         slam = run.final_slam()
     except RunError:
@@ -129,7 +129,7 @@ def replay(run: Recording, save: Path | None = None) -> None:
         for camera in (camera for camera, seen in of_cameras if step in seen):
             for image in images(history, camera, step):
                 entity = f"images/{camera.robot}/{camera.sensor}"
-                stream.image(entity, image, camera.size, pictures.at(camera, step, image.side))
+                stream.image(entity, image, camera.size, pictures and pictures.at(camera, step, image.side))
     if slam is not None and len(history.t_ns):
         mapped = slam.landmarks(exactly_known=False).ids
         stream.correlations(slam.covariance(*slam.robots, *mapped[:MOST]))

@@ -12,7 +12,7 @@ from PIL import Image
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.events import Frame
 from kalmark.logs import Log, open_log, write_native
-from kalmark.results.camera_images import Pictures
+from kalmark.results.camera_log import images_of_cameras
 from kalmark.results.record import record
 from kalmark.results.run import Run
 from kalmark.results.run_page import report_html
@@ -51,7 +51,8 @@ def test_a_run_shows_the_images_of_its_log_also_when_it_is_loaded(tmp_path: Path
     assert page.count("data:image/jpeg;base64,") == 4
     loaded = Run.load(tmp_path / "run")
     for one in (run, loaded):
-        pictures = Pictures(one)
+        pictures = images_of_cameras(one)
+        assert pictures is not None
         assert all((pictures.at(camera, step) == images[step]).all() for step in range(4))
     video = write_video(loaded, tmp_path / "video.gif", fps=5, progress=False)
     with Image.open(video) as film:
@@ -59,7 +60,7 @@ def test_a_run_shows_the_images_of_its_log_also_when_it_is_loaded(tmp_path: Path
         shown = np.asarray(film.convert("L"), dtype=np.float64)
     assert (shown[:, shown.shape[1] // 2 :] < 60).mean() > 0.03  # the black of the tag
     shutil.rmtree(tmp_path / "log")
-    assert Pictures(loaded).at(camera, 1) is None
+    assert images_of_cameras(loaded) is None
     assert "data:image/jpeg;base64," not in report_html(loaded)
 
 
@@ -67,7 +68,9 @@ def test_a_run_without_images_has_no_pictures() -> None:
     world = load_world("thick_cloister_pinhole", ["steps=3"])
     log = simulate(world, 1)
     run = record(build_slam(world.config(), log), log, progress=False)
-    assert Pictures(run).at(run.history.cameras[0], 1) is None
+    pictures = images_of_cameras(run)
+    assert pictures is not None
+    assert pictures.at(run.history.cameras[0], 1) is None
 
 
 def test_a_pair_shows_each_of_its_images_also_from_files(tmp_path: Path) -> None:
@@ -77,8 +80,10 @@ def test_a_pair_shows_each_of_its_images_also_from_files(tmp_path: Path) -> None
     again = open_log(tmp_path / "log")
     run = record(build_slam(world.config(), again), again, progress=False)
     camera, frames = run.history.cameras[0], [event for event in log.events if isinstance(event, Frame)]
+    pictures = images_of_cameras(run)
+    assert pictures is not None
     for step, frame in enumerate(frames):
         right = frame.right_grey()
         assert not (right == frame.grey()).all()
-        assert (Pictures(run).at(camera, step, "left") == frame.grey()).all()
-        assert (Pictures(run).at(camera, step, "right") == right).all()
+        assert (pictures.at(camera, step, "left") == frame.grey()).all()
+        assert (pictures.at(camera, step, "right") == right).all()
