@@ -145,6 +145,20 @@ def test_a_report_has_the_repeats_that_are_not_merged_and_a_saved_map_resumes_bi
     np.testing.assert_array_equal(slams[0].covariance("rover"), slams[1].covariance("rover"))
 
 
+def test_the_newer_part_begins_where_the_robot_lost_its_way_also_where_an_older_landmark_was_taken_for_one() -> None:
+    rng, slam, T = np.random.default_rng(1), empty(), np.array([60.0, 3.0, 2.4])
+    places = rng.uniform(0, 30, (60, 2))
+    older, moved, by_x = part(slam, places, rng), from_frame(T, places)[0], np.argsort(places[:, 0])
+    alone, others = by_x[:8], by_x[12:]  # seen with none of the others
+    newer = part(slam, moved[alone], rng) + part(slam, moved[others], rng)
+    slam.tracks.note_scan([older[int(by_x[30])], *newer[:3]])
+    (repeat,) = find_repeats(slam.map, slam.tracks)
+    assert sorted(repeat.newer) == sorted(newer)
+    wanted = {(older[i], name) for i, name in zip([*alone, *others], newer, strict=True)}
+    assert {*repeat.pairs} <= wanted
+    assert len({*repeat.pairs} & {*list(zip([older[i] for i in alone], newer, strict=False))}) >= 6
+
+
 def test_a_displaced_part_is_as_uncertain_as_it_was_off_and_keeps_its_shape() -> None:
     rng, slam, T = np.random.default_rng(1), empty(), np.array([5.0, 3.0, 0.4])
     places = rng.uniform(0, 30, (60, 2))

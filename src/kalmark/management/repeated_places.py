@@ -278,19 +278,20 @@ def _grown(look: _RepeatCandidates, T: Array, pairs: Index) -> _Constellation:
 def _agreeing(look: _RepeatCandidates, T: Array, pairs: Index) -> tuple[Index, Index]:
     """Return the landmarks of the part of the first of pairs, and those of the other part, on which T moves them."""
     sides = _sides(look, pairs)
+    return _matched(look, T, pairs, sides > 0, sides < 0)
+
+
+def _matched(look: _RepeatCandidates, T: Array, pairs: Index, of: Flags, others: Flags) -> tuple[Index, Index]:
+    """Return the landmarks of some (N,) that T, of these pairs, moves onto others (N,), each the nearest of its own."""
     middle = look.places[pairs[:, 0]].mean(axis=0)
     spread = math.sqrt(float(((look.places[pairs[:, 0]] - middle) ** 2).sum()))
-    a = np.flatnonzero(sides > 0)
-    lever = np.linalg.norm(look.places[a] - middle, axis=1) / max(spread, look.tolerance)
+    lever = np.linalg.norm(look.places - middle, axis=1) / max(spread, look.tolerance)
     reach = look.tolerance * (1.0 + lever)
-    near = reach <= LOOSE * look.spacing + look.tolerance
-    a, reach = a[near], reach[near]
-    far, b = look.tree.query(from_frame(T, look.places[a])[0])
-    fits = (far <= reach) & (sides[b] < 0)
-    a, b, far = a[fits], b[fits], far[fits]
-    order = np.argsort(far, kind="stable")
-    _, first = np.unique(b[order], return_index=True)
-    return a[order[first]], b[order[first]]
+    far, onto = look.tree.query(from_frame(T, look.places)[0])
+    a = np.flatnonzero(of & others[onto] & (far <= reach) & (reach <= LOOSE * look.spacing + look.tolerance))
+    a = a[np.argsort(far[a], kind="stable")]
+    b, first = np.unique(onto[a], return_index=True)
+    return a[first], b
 
 
 def _sides(look: _RepeatCandidates, pairs: Index) -> Index:
@@ -371,27 +372,36 @@ def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constell
     # as likely by chance: the ratio exceeds 1 over it as seldom; one that the covariance excludes is less likely yet
     if score <= -math.log(FALSE_ALARMS if agrees else SURE):
         return None
-    sure = bool(p <= SURE and fits and not rivals)
+    sure, newer = bool(p <= SURE and fits and not rivals), _newer(look, T, pairs)
     if sure:  # then two of a pair that were seen in one scan were so by a wrong association
-        a, b = _agreeing(look, T, pairs)
+        a, b = _matched(look, T, pairs, ~newer, newer)
         pairs = np.column_stack([a, b])[~(look.given[a] & look.given[b])]
     named = [(look.names[a], look.names[b]) for a, b in pairs.tolist()]
+    named_newer = [look.names[i] for i in np.flatnonzero(newer).tolist()]
     middle = look.places[pairs[:, 1]].mean(axis=0)
     shift = middle - look.places[pairs[:, 0]].mean(axis=0)
-    return Repeat(named, T, middle, shift, score, p, agrees, sure, _newer(look, pairs))
+    return Repeat(named, T, middle, shift, score, p, agrees, sure, named_newer)
 
 
-def _newer(look: _RepeatCandidates, pairs: Index) -> list[Id]:
-    """Return the landmarks of the newer part: by those that they were seen with, else by age.
+def _newer(look: _RepeatCandidates, T: Array, pairs: Index) -> Flags:
+    """Return which landmarks (N,) are of the newer part: begun since its onset, and seen with no more of the older one.
 
-    It begins where fewest of the pairs have one on the wrong side, which was taken for another: these do not count.
+    The onset is where most of those that T moves onto younger ones have one on either side, others were taken for
+    another; of such times that which parts fewest landmarks that were seen together.
     """
-    older, newer = np.sort(pairs, axis=0).T
-    wrong = len(older) - np.searchsorted(older, newer) + np.arange(len(newer))
-    begin = newer[wrong.argmin()]
-    sides = _sides(look, pairs[(pairs[:, 0] < begin) & (begin <= pairs[:, 1])])
-    mine = (sides < 0) | ((sides == 0) & (np.arange(len(sides)) >= begin))
-    return [look.names[i] for i in np.flatnonzero(mine).tolist()]
+    n, every = len(look.names), np.ones(len(look.names), dtype=np.bool_)
+    a, b = _matched(look, T, pairs, every, every)
+    pairs = np.column_stack([a, b])[a < b]
+    onset = int(np.lexsort((_parted(np.column_stack(np.divmod(look.codes, n)), n), -_parted(pairs, n)))[0])
+    sides = _sides(look, pairs[(pairs[:, 0] < onset) & (onset <= pairs[:, 1])])
+    return np.asarray((sides <= 0) & (np.arange(n) >= onset))
+
+
+def _parted(pairs: Index, n: int) -> Index:
+    """Return of each time (n,), that before a landmark, how many pairs (K, 2) in the order of their age it parts."""
+    ends = (np.bincount(column, minlength=n) for column in np.sort(pairs, axis=1).T)
+    begun, ended = (np.concatenate([[0], np.cumsum(each)[:-1]]) for each in ends)
+    return np.asarray(begun - ended)
 
 
 def _differ(one: _Constellation, other: _Constellation) -> bool:
