@@ -23,7 +23,7 @@ from kalmark.events import Control, Event, Scan, sort_key, unit_quaternion
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.pose_frames import ORIGIN
-from kalmark.geometry.rotations import matrix
+from kalmark.geometry.rotations import exp, matrix
 from kalmark.logs.known_map import TAG, KnownLandmark
 from kalmark.logs.log import LandmarkPlaces, Log, Section, Trajectory
 from kalmark.logs.source import (
@@ -33,7 +33,6 @@ from kalmark.logs.source import (
     nanoseconds_of_text,
     one_robot,
     read_mapping,
-    vector_frame,
 )
 from kalmark.logs.table_columns import CORNERS, INCREMENT3
 from kalmark.vision.camera_calibration import INTRINSICS, lens
@@ -130,8 +129,8 @@ def add_body(scene: TagSetup, name: str, body: Section) -> None:
 
 def frame_of(pose: Section) -> Array:
     """Return the frame (7,) of a pose as TagSLAM writes it: position and rotation vector, child in parent."""
-    parts = [[float(pose[part][axis]) for axis in "xyz"] for part in ("position", "rotation")]
-    return vector_frame(*parts)
+    place, turn = (np.array([float(pose[part][axis]) for axis in "xyz"]) for part in ("position", "rotation"))
+    return np.append(place, exp(turn))
 
 
 def read_cameras(folder: Path) -> tuple[dict[str, Section], dict[str, Array]]:

@@ -9,10 +9,10 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.datasets import matlab
+from kalmark.datasets.text_logs import file_in
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Names, Times
-from kalmark.logs.source import file_in
 
 
 def variables(path: Path) -> set[str]:

@@ -23,15 +23,14 @@ from pathlib import Path
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.datasets.text_logs import STEP_NS, begins_with
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.logs.log import Log, Section
 from kalmark.logs.source import (
-    STEP_NS,
     Format,
     Request,
-    begins_with,
     nanoseconds_of_text,
     number_of_text,
     one_robot,

@@ -37,6 +37,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.datasets.text_logs import STEP_NS
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, short_text, unit_quaternion
 from kalmark.geometry import frames, frames3d
@@ -45,7 +46,6 @@ from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew
 from kalmark.logs.known_map import from_triangle
 from kalmark.logs.log import LandmarkPlaces, Log, Names, Section, Trajectory
 from kalmark.logs.source import (
-    STEP_NS,
     Format,
     Request,
     landmark_id,
@@ -56,7 +56,6 @@ from kalmark.logs.source import (
 )
 from kalmark.logs.table_columns import BEAM, INCREMENT2, INCREMENT3, POSITION
 
-SECOND_NS = 10**9
 ROBOT, SENSOR, LOOPS = "robot", "sensor", "loops"
 BEARINGS, BEARING = "bearings", "EDGE_BEARING_SE2_XY"
 TORO = {"VERTEX2": "VERTEX_SE2", "EDGE2": "EDGE_SE2"}
@@ -253,7 +252,7 @@ def _loops(graph: Graph, ids: list[int], t_ns: dict[int, int]) -> list[Scan]:
     scans = list[Scan]()
     for b, begins in rows.items() if any(rows.values()) else ():
         y, cov = [[graph.moves[a, b][k] for a in begins] for k in (0, 1)]
-        times = [t_ns[a] // SECOND_NS for a in begins]
+        times = [t_ns[a] // STEP_NS for a in begins]
         scans.append(Scan(t_ns=t_ns[b], robot=ROBOT, sensor=LOOPS, y=y, ids=times, cov=cov if begins else None))
     return scans
 

@@ -9,11 +9,12 @@ import re
 from pathlib import Path
 from typing import Annotated
 
+from kalmark.datasets.text_logs import read_points
 from kalmark.declare import Number
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, short_text, sort_key
 from kalmark.logs.log import Log, Names, Trajectory
-from kalmark.logs.source import Format, Request, one_of, read_points, text_rows, timed_rows
+from kalmark.logs.source import Format, Request, one_of, text_rows, timed_rows
 from kalmark.logs.table_columns import BEAM
 
 SENSOR = "camera"

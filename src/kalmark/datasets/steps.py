@@ -24,20 +24,17 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.datasets.text_logs import STEP_NS, begins_with, file_in, read_points
 from kalmark.declare import Within
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Id, Scan, short_text
 from kalmark.logs.log import Log
 from kalmark.logs.source import (
-    STEP_NS,
     Format,
     Request,
-    begins_with,
-    file_in,
     landmark_id,
     number_of_text,
     one_robot,
-    read_points,
     text_rows,
 )
 from kalmark.logs.table_columns import BEAM, INCREMENT2, POSITION

@@ -21,7 +21,7 @@ from kalmark.errors import LogError
 from kalmark.events import LONGEST_ID, MOST, MOST_OTHER, Event, Id, short_text, sort_key
 from kalmark.files import refuse_aliases
 from kalmark.geometry import rotations
-from kalmark.logs.log import LandmarkPlaces, Log, Names, Section
+from kalmark.logs.log import Log, Names, Section
 from kalmark.logs.table_columns import TIMES, in_unit_of
 
 Refuse = Callable[[str], None]
@@ -32,8 +32,6 @@ _OPENCV_HEAD = re.compile(r"\A%YAML:[^\n]*")  # which is no YAML
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _LONGEST_TIME = 60  # characters; 2**63 ns in seconds has 20
 _T_MAX_NS = 2**63 - 1
-STEP_NS = 1_000_000_000
-"""Formats whose steps carry no time get one second a step."""
 
 
 class LeftOut(str):
@@ -123,18 +121,6 @@ def one_robot(
         skipped=request.skipped, control_columns={robot: controls} if controls else {},
         sensor_columns={(robot, sensor): columns for sensor, columns in sensors.items()}, **rest,
     )  # fmt: skip
-
-
-def file_in(path: Path, name: str) -> Path:
-    """Return the file of this name in a folder, or the path itself if it is not a folder."""
-    return path / name if path.is_dir() else path
-
-
-def begins_with(file: Path, starts: Iterable[bytes], size: int = 65536) -> bool:
-    """Return whether a line among the first bytes of a file has one of these starts."""
-    with file.open("rb") as stream:
-        begin = b"\n" + stream.read(size)
-    return any(b"\n" + start in begin for start in starts)
 
 
 def folder_of(path: Path, names: Iterable[str]) -> Path | None:
@@ -258,21 +244,6 @@ def text_rows(path: Path, text: str | None = None) -> Iterator[tuple[int, list[s
             yield line, cells
 
 
-def read_points(
-    path: Path, refuse: Refuse, id_of: Callable[[str], Id], sizes: tuple[int, ...], expected: str
-) -> LandmarkPlaces:
-    """Return the positions by id in rows `id x y` of so many cells, or {} without the file."""
-    points = {}
-    for line, cells in text_rows(path) if path.is_file() else ():
-        try:
-            if len(cells) not in sizes:
-                raise ValueError
-            points[id_of(cells[0])] = np.array([number_of_text(cell) for cell in cells[1:3]])
-        except ValueError:
-            refuse(f"{path}:{line}: {short_text(' '.join(cells))}, expected {expected}")
-    return points
-
-
 def rows_in_time(
     file: Path, rows: Iterable[tuple[int, list[str]]], refuse: Refuse = raise_refusal, unit: str = "s",
     strictly: bool = True,
@@ -320,12 +291,6 @@ def timed_rows(
 def frame(position: Any, matrix: Any) -> Array:
     """Return the frame (7,), x y z qx qy qz qw, of a position (3,) and a rotation matrix (3, 3), local to global."""
     turn = rotations.from_matrix(np.array(matrix, dtype=np.float64))
-    return np.append(np.asarray(position, dtype=np.float64).reshape(3), turn)
-
-
-def vector_frame(position: Any, vector: Any) -> Array:
-    """Return the frame (7,) of a position (3,) m and a rotation vector (3,) rad."""
-    turn = rotations.exp(np.array(vector, dtype=np.float64))
     return np.append(np.asarray(position, dtype=np.float64).reshape(3), turn)
 
 
