@@ -35,6 +35,12 @@ def skew(v: Array) -> Array:
 
 
 @compiled
+def _square(v: Array) -> float:
+    """Return v'v of the first three numbers of v (3 or more,)."""
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+
+
+@compiled
 def normalize(q: Array) -> Array:
     """Return q (4,) divided by its norm.
 
@@ -124,7 +130,7 @@ def exp(v: Array) -> Array:
     >>> km.geometry.rotations.exp(np.array([0.0, 0.0, np.pi])).round(3)
     array([0., 0., 1., 0.])
     """
-    a = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    a = math.sqrt(_square(v))
     s = math.sin(0.5 * a) / a if a > 1e-12 else 0.5
     return np.array([s * v[0], s * v[1], s * v[2], math.cos(0.5 * a)])
 
@@ -136,7 +142,7 @@ def log(q: Array) -> Array:
     >>> km.geometry.rotations.log(np.array([0.0, 0.0, 1.0, 0.0])).round(3)
     array([0.   , 0.   , 3.142])
     """
-    s = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    s = math.sqrt(_square(q))
     sign = -1.0 if q[3] < 0 else 1.0
     k = sign * (2.0 * math.atan2(s, abs(q[3])) / s if s > 1e-12 else 2.0)
     return np.array([k * q[0], k * q[1], k * q[2]])
@@ -145,7 +151,7 @@ def log(q: Array) -> Array:
 @compiled
 def _polynomial(p: float, q: float, v: Array) -> Array:
     """Return I + p [v]x + q [v]x^2 (3, 3), with [v]x^2 = v v' - v'v I."""
-    out, rest = np.empty((3, 3)), 1.0 - q * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    out, rest = np.empty((3, 3)), 1.0 - q * _square(v)
     for i in range(3):
         for j in range(3):
             out[i, j] = q * v[i] * v[j]
@@ -155,6 +161,17 @@ def _polynomial(p: float, q: float, v: Array) -> Array:
         out[k, j] += p * v[i]
         out[j, k] -= p * v[i]
     return out
+
+
+@compiled
+def _coefficients(a2: float) -> tuple[float, float]:
+    """Return p and q of V(v) = I + p [v]x + q [v]x^2, with a2 = v'v."""
+    if a2 < 1e-2:
+        p = 1 / 2 - a2 * (1 / 24 - a2 * (1 / 720 - a2 / 40320))
+        return p, 1 / 6 - a2 * (1 / 120 - a2 * (1 / 5040 - a2 / 362880))
+    a = math.sqrt(a2)
+    half = math.sin(0.5 * a)
+    return 2.0 * half * half / a2, (a - math.sin(a)) / (a2 * a)
 
 
 @compiled
@@ -168,14 +185,7 @@ def left_jacobian(v: Array) -> Array:
            [ 0.1  ,  0.993,  0.   ],
            [ 0.   ,  0.   ,  1.   ]])
     """
-    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if a2 < 1e-2:
-        p = 1 / 2 - a2 * (1 / 24 - a2 * (1 / 720 - a2 / 40320))
-        q = 1 / 6 - a2 * (1 / 120 - a2 * (1 / 5040 - a2 / 362880))
-    else:
-        a = math.sqrt(a2)
-        half = math.sin(0.5 * a)
-        p, q = 2.0 * half * half / a2, (a - math.sin(a)) / (a2 * a)
+    p, q = _coefficients(_square(v))
     return _polynomial(p, q, v)
 
 
@@ -188,7 +198,7 @@ def left_jacobian_inverse(v: Array) -> Array:
            [-0.1  ,  0.997,  0.   ],
            [ 0.   ,  0.   ,  1.   ]])
     """
-    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    a2 = _square(v)
     if a2 < 1e-2:
         q = 1 / 12 + a2 * (1 / 720 + a2 * (1 / 30240 + a2 / 1209600))
     else:
@@ -204,17 +214,13 @@ def left_jacobian_rate(v: Array, a: Array) -> Array:
     >>> km.geometry.rotations.left_jacobian_rate(np.array([0.0, 0.0, 0.2]), np.array([1.0, 0.0, 0.0])).shape
     (3, 3)
     """
-    a2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    a2 = _square(v)
+    p, q = _coefficients(a2)
     if a2 < 1e-2:
-        p = 1 / 2 - a2 * (1 / 24 - a2 * (1 / 720 - a2 / 40320))
-        q = 1 / 6 - a2 * (1 / 120 - a2 * (1 / 5040 - a2 / 362880))
         p_a2, q_a2 = -1 / 24 + a2 * (1 / 360 - a2 / 13440), -1 / 120 + a2 * (1 / 2520 - a2 / 120960)
     else:
         t = math.sqrt(a2)
-        half = math.sin(0.5 * t)
-        p, q = 2.0 * half * half / a2, (t - math.sin(t)) / (a2 * t)
-        p_a2 = 0.5 * math.sin(t) / (a2 * t) - p / a2
-        q_a2 = 0.5 * p / a2 - 1.5 * q / a2
+        p_a2, q_a2 = 0.5 * math.sin(t) / (a2 * t) - p / a2, 0.5 * p / a2 - 1.5 * q / a2
     c = np.cross(v, a)
     cc = np.cross(v, c)
     rate = np.outer(p_a2 * c + q_a2 * cc, 2.0 * v)

@@ -114,7 +114,7 @@ class HeldInput:
         self.t_ns = self.u = self.N = self.usual = self.mean = None
         self.fresh, self.gaps = True, None if self.coasts else gaps
         self.rests_until_ns = -math.inf if rests_until_ns is None else rests_until_ns
-        self._before: tuple[Any, ...] = ()
+        self._before: tuple[dict[str, Any], dict[str, Any]] = {}, {}
 
     def restored(self) -> None:
         """Check the arrays of a file.  Raises MapError."""
@@ -125,13 +125,13 @@ class HeldInput:
                 raise MapError(f"a control has an array {array.shape}, expected {shape}")
 
     def __enter__(self) -> Self:
-        watched = None if self.gaps is None else vars(self.gaps).copy()
-        self._before = self.t_ns, self.u, self.N, self.usual, self.mean, self.fresh, watched
+        self._before = {**vars(self)}, {} if self.gaps is None else {**vars(self.gaps)}
         return self
 
     def __exit__(self, kind: Any, *_: object) -> None:
+        (own, watched), self._before = self._before, ({}, {})
         if kind is not None and issubclass(kind, EventError):
-            self.t_ns, self.u, self.N, self.usual, self.mean, self.fresh, watched = self._before
+            vars(self).update(own)
             if self.gaps is not None:
                 vars(self.gaps).update(watched)
 
@@ -164,10 +164,12 @@ class HeldInput:
         if self.gaps is None or to_ns <= self.gaps.late_ns:
             return None
         unknown = self.gaps.unknown(to_ns, u)
-        if unknown is None:
-            return None
+        return None if unknown is None else self._uncontrolled(0.0, unknown)
+
+    def _uncontrolled(self, dt_s: float, unknown: Array | None = None) -> MotionPart:
+        """Return a part of its motion without a control."""
         k = len(self.motion.columns)
-        return MotionPart(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)
+        return MotionPart(np.zeros(k), np.zeros((k, k)), dt_s, True, True, unknown)
 
     def noticed(self) -> tuple[Gap, ...]:
         """Return the gap that was detected since the last call, if any."""
@@ -204,10 +206,7 @@ class HeldInput:
     def _coast(self, to_ns: int) -> MotionPart | None:
         """Return the part of a robot that needs no control to move, from the first event on."""
         t_ns, self.t_ns = self.t_ns, to_ns
-        if t_ns is None or to_ns <= t_ns:
-            return None
-        k = len(self.motion.columns)
-        return MotionPart(np.zeros(k), np.zeros((k, k)), (to_ns - t_ns) * 1e-9, True, True)
+        return None if t_ns is None or to_ns <= t_ns else self._uncontrolled((to_ns - t_ns) * 1e-9)
 
     def accept(self, control: Control) -> list[MotionPart]:
         """Take a new control; return the parts of motion it closes."""
@@ -244,9 +243,8 @@ class HeldInput:
             gaps.leave_out(control)
             self.fresh = True
             return [] if part is None else [part]
-        k, unknown = len(self.motion.columns), gaps.leave_out(control)
-        self.t_ns = control.t_ns
-        return [] if unknown is None else [MotionPart(np.zeros(k), np.zeros((k, k)), 0.0, True, True, unknown)]
+        unknown, self.t_ns = gaps.leave_out(control), control.t_ns
+        return [] if unknown is None else [self._uncontrolled(0.0, unknown)]
 
 
 @dataclass
