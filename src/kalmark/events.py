@@ -13,7 +13,7 @@ from decimal import Decimal
 from itertools import groupby
 from numbers import Real
 from operator import attrgetter
-from typing import Any
+from typing import Any, ClassVar
 from unicodedata import category
 
 import numpy as np
@@ -259,12 +259,13 @@ class Control(_Timed):
     `u` has the motion model's shape and units; `cov` (same size, squared) overrides the model's own noise.
     `share` is less than 1 for a part of an increment, whose noise is that share of the whole one's, `cov` or the
     model's, and the variances `uneven` (k,) besides.  `largest` is the largest magnitude in `u`, `largest_cov` that
-    in `cov`.
+    in `cov`.  `sensor` is "", as of all events without one.
 
     >>> km.Control(t_s=0.5, robot="rover", u=(0.5, 0.02)).t_ns
     500000000
     """
 
+    sensor: ClassVar[str] = ""
     t_ns: int
     robot: str
     u: Array
@@ -373,6 +374,7 @@ class Fix(_Timed):
     array([1., 2.])
     """
 
+    sensor: ClassVar[str] = ""
     t_ns: int
     robot: str
     y: Array
@@ -511,7 +513,7 @@ def label_of_event(event: Event) -> str:
 
 def kind_of(event: Event) -> tuple[str, str, str]:
     """Return the kind of an event, its robot and its sensor ("" of what has none)."""
-    return type(event).__name__, event.robot, event.sensor if isinstance(event, Scan | Raw) else ""
+    return type(event).__name__, event.robot, event.sensor
 
 
 def sort_key(event: Event) -> tuple[int, int, str, str]:
@@ -524,12 +526,7 @@ def sort_key(event: Event) -> tuple[int, int, str, str]:
     >>> sort_key(km.Scan(0.1, "rover", "lidar", [[4.0, 0.3]]))
     (100000000, 1, 'rover', 'lidar')
     """
-    return (
-        event.t_ns,
-        _RANK.get(type(event), 1),
-        event.robot,
-        event.sensor if isinstance(event, Scan | Raw) else "",
-    )
+    return event.t_ns, _RANK.get(type(event), 1), event.robot, event.sensor
 
 
 def sort_events(events: list[Event]) -> list[Event]:

@@ -260,42 +260,23 @@ class Report:
     [(7, 'new')]
     """
 
-    __slots__ = (
-        "Z",
-        "_made",
-        "compared",
-        "e",
-        "event",
-        "gaps",
-        "judged",
-        "late",
-        "merged",
-        "removed",
-        "repeats",
-        "replaced",
-        "seen_at",
-        "standing",
-        "y",
-        "z",
-    )
+    judged: tuple[JudgedScan, ...] = ()  # of which `observations` are made when they are needed
+    removed: tuple[tuple[Id, str], ...] = ()
+    merged: tuple[tuple[Id, Id, str], ...] = ()
+    late: tuple[Late, ...] = ()
+    gaps: tuple[Gap, ...] = ()
+    repeats: tuple[Repeat, ...] = ()
+    replaced = 0.0
+    standing: Observation | None = None
+    compared: Compared | None = None
+    seen_at: Array = NOTHING
+    e: Array = NOTHING
+    z: Array = NOTHING
+    Z: Array = NOTHING
+    _made: tuple[Observation, ...] = ()
 
     def __init__(self, event: Event, y: Array = NOTHING) -> None:
-        self.event = event
-        self.judged: tuple[JudgedScan, ...] = ()  # of which `observations` are made when they are needed
-        self._made: tuple[Observation, ...] = ()
-        self.removed: tuple[tuple[Id, str], ...] = ()
-        self.merged: tuple[tuple[Id, Id, str], ...] = ()
-        self.late: tuple[Late, ...] = ()
-        self.gaps: tuple[Gap, ...] = ()
-        self.repeats: tuple[Repeat, ...] = ()
-        self.replaced = 0.0
-        self.standing: Observation | None = None
-        self.compared: Compared | None = None
-        self.seen_at: Array = NOTHING
-        self.y = y
-        self.e: Array = NOTHING
-        self.z: Array = NOTHING
-        self.Z: Array = NOTHING
+        self.event, self.y = event, y
 
     @property
     def observations(self) -> tuple[Observation, ...]:

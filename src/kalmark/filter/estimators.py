@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from kalmark.arrays import Array, Index
-from kalmark.compiled import compile_on_second_core, form_for, python_form
+from kalmark.compiled import compile_on_second_core, form_for
 from kalmark.declare import Count, Positive, register
 from kalmark.filter import corrections, prediction
 from kalmark.filter.estimator_protocols import (
@@ -76,7 +76,7 @@ class _Estimator:
         """Move a robot; return whether all of it is finite: if not, nothing has changed.  [S] (14)-(17)."""
         model, robot, added, *control = movement
         m, robot, _, here = map_.movable(robot, added)
-        run: Any = prediction.predict if isinstance(model, tuple) else python_form(prediction.predict)
+        run: Any = form_for(model, prediction.predict)
         where = m.x, m.x_first, m.P, m.n, m.blocks, m.atoms, corrections.generator_address(m.axes)
         return bool(run(where, (model, robot, here, *control), self.from_first, self.transports and m.axes == 6))
 
@@ -101,9 +101,8 @@ class _Estimator:
         return done
 
     def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan, parallax: bool) -> Correction:
-        run = type(self).compiled if isinstance(model, tuple) else python_form(type(self).compiled)
-        whole = m.whole if parallax else (*m.whole[:-1], corrections.routines(m.axes, False, m.dependent))
-        return Correction(*run(model, whole, scan, self._option(m)))
+        run = form_for(model, type(self).compiled)
+        return Correction(*run(model, m.arrays_for(parallax), scan, self._option(m)))
 
     def _one_by_one(
         self, model: Any, m: StochasticMap, scan: corrections.Scan, together: Correction, parallax: bool

@@ -168,7 +168,11 @@ class StochasticMap(Layout):
     @property
     def whole(self) -> corrections.Map:
         """The map as compiled code takes it."""
-        ways = corrections.routines(self.axes, self.inverse_depths, self.dependent)
+        return self.arrays_for(parallax=True)
+
+    def arrays_for(self, parallax: bool) -> corrections.Map:
+        """Return the map as compiled code takes it, for a correction of inverse distances by `parallax` or not."""
+        ways = corrections.routines(self.axes, parallax and self.inverse_depths, self.dependent)
         return self.x, self.P, self.n, self.blocks, self.atoms, self.axes, ways
 
     # ------------------------------------------------------------------ reading

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -96,10 +97,16 @@ def check_numbers(value: Any, size: int, what: str, error: type[KalmarkError]) -
 SMALLEST_BOUND = min(MOST.values())
 
 
+@lru_cache(maxsize=256)
+def _are_covariances(numbers: bytes, shape: tuple[int, int, int], definite: bool) -> bool:
+    """Return whether some numbers are certainly covariances (K, m, m); most sensors repeat theirs."""
+    covs = np.frombuffer(numbers).reshape(shape).copy()  # as an event has them: numba compiles per kind of array
+    return kernels.are_covariances(covs, (-0.1 if definite else 0.1) * SEMIDEFINITE)
+
+
 def _refuse_bad_noise(event: Control | Scan, covs: Array, columns: tuple[str, ...], *, definite: bool) -> None:
     """Refuse the covariances (K, m, m) of an event that are none, or have sigmas larger than means anything."""
-    margin = 0.1 * SEMIDEFINITE
-    if not kernels.are_covariances(covs, -margin if definite else margin):
+    if not _are_covariances(covs.tobytes(), covs.shape, definite):
         _refuse_indefinite(covs, f"{label_of_event(event)}: cov", definite)
     if event.largest_cov > SMALLEST_BOUND**2 and covs.shape[-1] == len(columns):
         sigmas = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))

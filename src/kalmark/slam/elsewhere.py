@@ -37,31 +37,15 @@ from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.survey_checks import SURVEYED
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
-WIDER = 3.0  # times its sigmas by which an overconfident filter may be off
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
 HELD = 2  # scans of several landmarks that are held back without a second hypothesis
 MOST = 48  # landmarks of a constellation
 MEANWHILE = "mapped while its robot was elsewhere"
 
 
-def concerns(scan: ScanContext) -> bool:
-    """Return whether a scan determines where its robot is: by points of the plane; by points, tags or rays with ids."""
-    channel, ids = scan.channel, scan.event.ids
-    if channel.gives_places and scan.dimensions == 2:
-        return not channel.joins and channel.landmark.kind == "point"
-    is_known = ids is not None and None not in ids
-    return is_known and (channel.gives_rays or (channel.gives_places and channel.landmark.kind in ("point3", "tag")))
-
-
 def limit_of(state: State, scan: ScanContext) -> float:
-    """Return the d2 up to which an observation with an id is not far off; infinite where the gate is switched off.
-
-    An overconfident filter may be off by `WIDER` times its sigmas.
-    """
-    is_off = state.policies[scan.key].association.threshold(1, 0.0) == math.inf
-    if scan.event.ids is None or is_off or not concerns(scan):
-        return math.inf
-    return WIDER**2 * gate(SURVEYED, scan.channel.dof)
+    """Return the d2 up to which an observation with an id is not far off; infinite where the gate is switched off."""
+    return state.policies[scan.key].limit if scan.event.ids is not None and scan.locates else math.inf
 
 
 def misfits(state: State, scan: ScanContext, done: Correction) -> Flags:
@@ -82,7 +66,15 @@ def correct(
     if limit == math.inf:
         return state.corrected(update, scan.event, estimator)
     done = state.corrected(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
-    far = _far(scan, update, done, limit)
+    return done if done.fused.all() else hold_back_far(state, scan, names, update, done, estimator)
+
+
+def hold_back_far(
+    state: State, scan: ScanContext, names: Sequence[Any], update: Update, done: Correction,
+    estimator: Estimator | None = None,
+) -> Correction:  # fmt: skip
+    """Weigh the observations that a correction within `limit_of` left out; return what became of all, as `correct`."""
+    far = _far(scan, update, done, limit_of(state, scan))
     if not far:
         return done
     of = state.evidence.setdefault(scan.event.robot, Evidence())
@@ -102,8 +94,6 @@ def correct(
 
 def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> list[int]:
     """Return the observations beyond a limit, and those of things that cannot be seen from here."""
-    if np.count_nonzero(done.fused) == len(done.fused):
-        return []
     far = np.flatnonzero(~done.fused & ~(done.d2 <= limit)).tolist()
     if not far:
         return []

@@ -281,18 +281,15 @@ class Moving:
         That holds at the means of the constants, and B is that of the control as it usually is.  The first is the error
         of the control where that is `shared`.
         """
-        if not shared and self.bias is None:
-            return [], no_effect(len(part.u)), part.u
-        slots, columns, u = [], [], part.u
-        if shared and self.error is not None:
-            slots, columns = [self.error], [identity_effect(len(u))]
-        if self.bias is not None and isinstance(self.motion, SelfCalibrating):
-            a = map_.mean(self.bias)
-            true, U_a = true_control(self.motion, u, a, part.dt_s)
-            if part.usual is not None:
-                U_a = true_control(self.motion, part.usual, a, part.dt_s)[1]
-            slots, columns, u = [*slots, self.bias], [*columns, U_a], true - U_a @ a
-        return slots, np.hstack(columns) if len(columns) > 1 else columns[0], u
+        u, slots = part.u, [self.error] if shared and self.error is not None else []
+        B = identity_effect(len(u)) if slots else no_effect(len(u))
+        if self.bias is None or not isinstance(self.motion, SelfCalibrating):
+            return slots, B, u
+        a = map_.mean(self.bias)
+        true, U_a = true_control(self.motion, u, a, part.dt_s)
+        if part.usual is not None:
+            U_a = true_control(self.motion, part.usual, a, part.dt_s)[1]
+        return [*slots, self.bias], np.hstack([B, U_a]), true - U_a @ a
 
     def leads_somewhere(self, map_: Map, parts: Sequence[MotionPart]) -> bool:
         """Return whether parts of its controls, one after the other, lead to finite places, with finite covariances."""
@@ -310,21 +307,17 @@ class Moving:
         """Return whether the error of a part is a block of the map, which has that of other parts, too."""
         return self.error is not None and part.shares
 
-    def _diffusion(self, map_: Map, part: MotionPart) -> Array | None:
-        motion: Any = self.motion
-        if self.moves_itself:
-            return motion.diffusion_at(map_.mean(self.slot), part.u, part.dt_s)
-        return motion.diffusion(part.u, part.dt_s)
-
     def movement(self, map_: Map, part: MotionPart) -> Movement:
         """Return what one part of its control does to the robot in a map."""
-        D = self._diffusion(map_, part)
-        if part.unknown is not None:
-            D = part.unknown if D is None else part.unknown + D
+        u, N, dt_s, first, _last, unknown, _usual = part
+        motion: Any = self.motion
+        D = motion.diffusion_at(map_.mean(self.slot), u, dt_s) if self.moves_itself else motion.diffusion(u, dt_s)
+        if unknown is not None:
+            D = unknown if D is None else unknown + D
         shared = self._shares(part)
         slots, B, u = self.added(map_, part, shared)
-        noise = part.N, NO_NOISE if D is None else D
-        return Movement(self.model, self.slot, slots, shared, shared and part.first, B, u, *noise, part.dt_s)
+        D = NO_NOISE if D is None else D
+        return Movement(self.model, self.slot, slots, shared, shared and first, B, u, N, D, dt_s)
 
 
 def bias_name(robot: str) -> str:

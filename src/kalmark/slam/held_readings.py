@@ -59,6 +59,9 @@ class LastMeasurement:
     number: int = 1
     since_ns: int = 0
 
+    def __post_init__(self) -> None:
+        self._motions: list[MotionPart] = []  # which `went` and `doubt` do not have yet
+
     @classmethod
     def of(cls, y: Array, ids: tuple[Id | None, ...] | None) -> LastMeasurement:
         """Return the record of a first measurement."""
@@ -71,11 +74,19 @@ class LastMeasurement:
 
     def add_motion(self, part: MotionPart) -> None:
         """Add the motion of a part of a control, with its variances."""
-        u, variances = part.u, part.N.diagonal()
-        if part.dt_s > 0.0:
-            u, variances = u * part.dt_s, variances * part.dt_s**2
-        first = len(self.went) != len(u)
-        self.went, self.doubt = (u, variances) if first else (self.went + u, self.doubt + variances)
+        self._motions.append(part)
+        if len(self._motions) == TOGETHER:
+            self.sum_motions()
+
+    def sum_motions(self) -> None:
+        """Bring `went` and `doubt` up to date."""
+        for part in self._motions:
+            u, variances = part.u, part.N.diagonal()
+            if part.dt_s > 0.0:
+                u, variances = u * part.dt_s, variances * part.dt_s**2
+            first = len(self.went) != len(u)
+            self.went, self.doubt = (u, variances) if first else (self.went + u, self.doubt + variances)
+        self._motions.clear()
 
     def chance(self) -> float:
         """Return the probability that a new measurement has the same numbers, 1 if unknown; columns are independent."""
@@ -90,14 +101,16 @@ class LastMeasurement:
 
     def has_moved(self, velocity: Array, P: Array) -> bool:
         """Return whether the robot has moved since: by its controls or, if it has one, its velocity (v,), P (v, v)."""
+        self.sum_motions()
         x, variances = (velocity, np.diagonal(P)) if len(velocity) else (self.went, self.doubt)
         return bool(np.sum(x**2 / np.maximum(variances, 1e-30)) > gate(MOVED, max(len(x), 1)))
 
     def take(self, y: Array, ids: tuple[Id | None, ...] | None) -> bool:
         """Take a measurement; return whether it has the numbers of the one before."""
         self.number += 1
-        if ids == self.ids and y.shape == self.y.shape:
-            if y.item(0) == self.y.item(0) and (y == self.y).all():  # most differ in the first number
+        last = self.recent[-1]
+        if ids == self.ids and y.shape == last.shape:
+            if y.item(0) == last.item(0) and (y == last).all():  # most differ in the first number
                 return True
             self.recent.append(y)
             if len(self.recent) > TOGETHER:
@@ -106,6 +119,7 @@ class LastMeasurement:
             self._count()
             self.recent = [y]
         self.ids, self.went, self.doubt = ids, NOTHING, NOTHING
+        self._motions.clear()
         return False
 
     def _count(self) -> None:

@@ -52,22 +52,21 @@ def _nowhere(state: State, name: str, part: MotionPart) -> EventError:
 
 def move(state: State, name: str, part: MotionPart) -> None:
     """Move a robot by one part of its control: R <- f(R, u), P <- F P F' + Q.  [S] (14)-(17)."""
-    moving = state.moving[name]
+    moving, estimator = state.moving[name], state.estimator
     if not isinstance(moving.model, tuple):  # a user's: nothing is known of it
         refuse_nowhere(state, name, [part])
     if moving.error is None and part.shares and moving.leads_somewhere(state.map, [part]):
         with suppress(MapError):  # it is full: each part has an error of its own
             moving.error = state.map.add(Rn(len(part.u)), np.zeros(len(part.u)), part.N)
     before = state.pose(name) if moving.past is not None else None
-    if not state.estimator.predict(state.map, moving.movement(state.map, part)):
+    if not estimator.predict(state.map, moving.movement(state.map, part)):
         raise _nowhere(state, name, part)
     if moving.past is not None and before is not None and part.dt_s > 0.0:
         moving.past.add(part.dt_s, twist_between(before, state.pose(name), part.dt_s))
     for key, given in state.given.items():
         if key[0] == name:
             given.add_motion(part)
-    if name in state.pose_hypotheses and not state.pose_hypotheses[name].move(state.estimator, part):
-        del state.pose_hypotheses[name]
-    if name in state.sums and not state.sums[name].move(state.estimator, part):
-        del state.sums[name]
+    for others in (state.pose_hypotheses, state.sums):
+        if name in others and not others[name].move(estimator, part):
+            del others[name]
     state.clones.forget_current(name)

@@ -11,6 +11,7 @@ from kalmark.association.protocol import DEFERRED, NEW, REMAP, Answer, Associati
 from kalmark.errors import ModelError
 from kalmark.events import Scan
 from kalmark.filter.estimators import Estimator
+from kalmark.geometry.gaussian import gate
 from kalmark.management.ambiguous_tags import Mirrored
 from kalmark.management.attention import EVERYTHING, Attention
 from kalmark.management.delayed import Delayed
@@ -32,6 +33,9 @@ from kalmark.models.protocols import (
 )
 from kalmark.slam.robot import Mount, Robot
 from kalmark.tracks.channel import Channel, default_landmark
+from kalmark.tracks.survey_checks import SURVEYED
+
+WIDER = 3.0  # times its sigmas by which an overconfident filter may be off
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +48,9 @@ class Policy:
     scan, points of unknown depth become Euclidean where their linearity index falls below `linear`; the last
     `keep_poses` clones are kept for tentative landmarks.  `restarts`: rays may have to be started again
     (`ray_restarts.py`).  `contests`: where a landmark with an id was begun is weighed against observations that do not
-    fit (`tentative.py`), which are left out or count less.  `by_ids`: nothing is to be decided of a scan whose ids are
-    of landmarks of one type in the map.
+    fit (`tentative.py`), which are left out or count less.  `limit`: the d2 up to which an observation with an id is no
+    misfit, infinite where the gate is switched off or the sensor never determines where its robot is.  `by_ids`:
+    nothing is to be decided of a scan whose ids are of landmarks of one type in the map.
     """
 
     association: Association
@@ -62,6 +67,7 @@ class Policy:
     keep_poses: int
     restarts: bool
     contests: bool
+    limit: float
     by_ids: bool
 
 
@@ -93,6 +99,8 @@ def policy_of(
         not channel.finds_depth and channel.mount >= 0 and any(isinstance(kind, AnchoredHomogeneous) for kind in seen),
         (channel.robust is not None or association.threshold(channel.dof, 0.0) < math.inf)
         and delayed is None and (deferred is None or channel.is_ambiguous) and channel.starts_landmarks,
+        WIDER**2 * gate(SURVEYED, channel.dof)
+        if channel.locates_by_ids and association.threshold(1, 0.0) < math.inf else math.inf,
         type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
         and not (reviews or channel.robust is not None or looks_back or approaches),
     )  # fmt: skip

@@ -74,6 +74,8 @@ def members_of(state: State, head: Description) -> dict[str, bytes]:
         arrays.update({f"{prefix}{name}": array for name, array in map_.arrays()})
         return said | {"arrays": prefix}
 
+    for given in state.given.values():
+        given.sum_motions()
     writer = Writer({Map: map_said, Landmark: lambda of: _each(describe_model(of), _to_text)})
     said = head | {"columns": _columns(state.robots), "state": kind_of(State).write(writer, state)}
     arrays[NUMBERS] = writer.numbers()

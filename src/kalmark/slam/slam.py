@@ -139,8 +139,9 @@ class Slam(Estimate):
 
         Raises EventError for an event that cannot be used, DivergedError when a robot is lost for good.
         """
-        state, is_raw = self.state, isinstance(event, Raw)
-        take: Any = self._raw if is_raw else self._takes.get(type(event))
+        state, take = self.state, self._takes.get(type(event))
+        if take is None and isinstance(event, Raw):
+            take = self._raw
         if take is None:
             raise EventError(f"got {type(event).__name__}, expected a Control, a Scan, a Fix or raw data of a sensor")
         before = state.t_ns
@@ -153,7 +154,7 @@ class Slam(Estimate):
             self._refuse_ahead(event, before)
         try:
             report: Report = take(event)
-            if not is_raw:
+            if not isinstance(event, Raw):
                 state.settle()
             if event.robot in state.standing:
                 report.standing = state_corrections.correct_by_rest(state, event)

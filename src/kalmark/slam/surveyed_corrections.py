@@ -59,7 +59,7 @@ def correct_by_surveys(
         names[k] for k in np.flatnonzero(done.fused & (done.d2 <= least)).tolist() if state.is_surveyed(names[k])
     ]
     lost = state.surveys.judge(scan.event.robot, fitting, [names[k] for k in beyond if tried[k]])
-    if elsewhere.concerns(scan) or ((lost or state.surveys.contradict()) and is_doubted(state, scan)):
+    if scan.locates or ((lost or state.surveys.contradict()) and is_doubted(state, scan)):
         lost = False
     most = min(update.gate, elsewhere.limit_of(state, scan))
     out = np.array([k for k in beyond if (lost or not tried[k]) and done.d2[k] <= most], dtype=np.int64)

@@ -111,7 +111,8 @@ class Channel:
     clone of the robot's pose at its last scan.  `since` (1 + k,): the seconds since then, and the control in force
     where that has the turn rate.  `robust`: how outliers count less, "huber" or "student" (None: all count in full).
     Of a sensor that `lags`, whose lag is in the map, `past` (7 or 14,) is that of its robot (`mount_ago_in_plane`).
-    `classes` are those that the sensor reports of landmarks, None where it reports none.
+    `classes` are those that the sensor reports of landmarks, None where it reports none.  Its scans determine where its
+    robot is where it `locates` (by points of the plane) and, if all ids are known, where it `locates_by_ids`.
     """
 
     def __init__(
@@ -144,6 +145,10 @@ class Channel:
         self.gives_places = full and self.finds_depth and placed
         points = any(kind in EUCLIDEAN for kind in self.kinds) and not protocols.distances_alone(sensor)
         self.gives_rays = full and points and not (self.finds_depth or self.sees_velocity)
+        kind, flat = landmark.kind, self.dimensions == 2
+        self.locates = self.gives_places and flat and not self.joins and kind == "point"
+        by_points = self.gives_places and not flat and kind in ("point3", "tag")
+        self.locates_by_ids = self.locates or self.gives_rays or by_points
         self.has_limits, self.fov_rad = isinstance(sensor, protocols.Visible), protocols.field_of_view(sensor)
         segmented = (kind for kind, model in self.models.items() if isinstance(model.landmark, protocols.Segmented))
         self.points = self.kinds - {*segmented}  # kinds of landmarks that are no lines

@@ -94,6 +94,12 @@ class ScanContext:
         return self.event.cov is not None
 
     @property
+    def locates(self) -> bool:
+        """True if the scan determines where its robot is."""
+        ids = self.event.ids
+        return self.channel.locates or (self.channel.locates_by_ids and ids is not None and None not in ids)
+
+    @property
     def noise_varies(self) -> bool:
         """True if the noise of an observation depends on where its landmark is."""
         return self.channel.noise_at is not None and self.event.cov is None

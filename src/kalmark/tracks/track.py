@@ -236,8 +236,8 @@ class Tracks:
 
     def count(self, names: Iterable[Any], used: Iterable[bool]) -> None:
         """Count observations that were used, each at its landmark; those of robots are not counted."""
-        for name, fused in zip(names, used, strict=False):
-            if fused and (track := self.confirmed.get(name)):
+        for track, fused in zip(map(self.confirmed.get, names), used, strict=False):
+            if fused and track:
                 track.observations += 1
 
     def note_scan(self, names: list[Id]) -> None:
