@@ -17,6 +17,7 @@ from kalmark.models.model_check import check_model
 from kalmark.models.observe import PythonView, linearize, view_of
 from kalmark.models.pointwise import jacobian
 from kalmark.results.landmark_table import MapLandmarks
+from kalmark.simulate import load_world, simulate
 
 UNKNOWN = {"scale": 1.07, "bias_m": 0.3, "sigma_scale": 0.1, "sigma_bias_m": 0.3}
 BEACONS = {
@@ -177,3 +178,73 @@ def test_ranges_map_unknown_beacons_at_the_height_of_the_mount() -> None:
     odd = km.Robot("r", km.motion.Unicycle(), sensors={"s": km.Mount(km.sensors.Range(), **late)})  # type: ignore[arg-type]
     with pytest.raises(ModelError, match="its landmarks are point_height, expected point"):
         km.Slam(odd)
+
+
+RADIUS: Any = [
+    km.sensors.RangeBearingHeight(height_m=0.5, **UNKNOWN), km.sensors.RangeBearing3D(**UNKNOWN),
+    km.sensors.Bearing3D(), km.sensors.RangeBearing(**UNKNOWN), km.sensors.RangeBearingSignature(**UNKNOWN),
+    km.sensors.Bearing(),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("sensor", RADIUS, ids=lambda s: type(s).__name__)
+def test_ranges_and_angles_of_plane_and_space_have_their_jacobians_and_inverses(sensor: Any) -> None:
+    found = check_model(sensor, np.random.default_rng(0))
+    assert {"E_v", "V_y", "expect(invert(y)) = y"} <= {one.what for one in found}
+    assert all(one.ok for one in found)
+
+
+def test_a_robot_of_the_plane_starts_and_corrects_landmarks_at_heights() -> None:
+    rng, places = np.random.default_rng(2), np.array([[4.0, 1.0, 2.5], [2.0, -3.0, 1.0], [6.0, 2.0, 0.2]])
+    lidar = km.Mount(km.sensors.RangeBearingHeight(0.05, 0.01, 0.01, height_m=0.5))
+    slam = km.Slam(km.Robot("r", km.motion.Odometry2D(0.01, 0.0, 0.005), sensors={"lidar": lidar}))
+    pose = np.zeros(3)
+    for k in range(20):
+        T = km.geometry.to_frame(pose, places[:, :2])[0]
+        up = places[:, 2] - 0.5
+        flat = np.hypot(*T.T)
+        y = np.column_stack([np.hypot(flat, up), np.arctan2(T[:, 1], T[:, 0]), np.arctan2(up, flat)])
+        slam.process(km.Scan(float(k), "r", "lidar", y + rng.normal(size=y.shape) * (0.05, 0.01, 0.01), ids=[1, 2, 3]))
+        u = np.array([0.1, 0.0, 0.02])
+        pose = km.geometry.compose(pose, u + rng.normal(size=3) * (0.01, 0.0, 0.005))[0]
+        slam.process(km.Control(k + 0.5, "r", u))
+    error = np.concatenate([slam.mean(i) for i in (1, 2, 3)]) - places.ravel()
+    assert slam.landmark_model(1).kind == "point_height"  # type: ignore[union-attr]
+    assert error @ np.linalg.solve(slam.covariance(1, 2, 3), error) < 21.7  # of 9 degrees of freedom, 99 %
+
+
+def test_directions_in_space_start_rays_that_become_points() -> None:
+    place, eye = np.array([5.0, 1.0, 0.5]), km.Mount(km.sensors.Bearing3D(0.005, 0.005))
+    slam = km.Slam(km.Robot("d", km.motion.Odometry3D(), sensors={"eye": eye}))
+    for k in range(6):
+        p = place - [0.0, 0.5 * k, 0.2 * k]
+        y = [np.arctan2(p[1], p[0]), np.arctan2(p[2], np.hypot(p[0], p[1]))]
+        slam.process(km.Scan(float(k), "d", "eye", [y], ids=["a"]))
+        slam.process(km.Control(k + 0.5, "d", [0, 0.5, 0.2, 0, 0, 0]))
+    found, P = slam.place("a")
+    assert np.linalg.norm(found - place) < 0.05
+    assert np.sqrt(np.trace(P)) < 0.2
+
+
+def test_a_world_of_heights_is_of_a_sensor_that_measures_them(tmp_path: Path) -> None:
+    world = tmp_path / "w.yaml"
+    text = """
+world: {type: list, points_m: [[4, 1, 2.5], [2, -3, 1.0], [6, 2, 0.2]]}
+robots:
+  robot:
+    route: {type: constant, u: [0.5, 0.1]}
+    motion: {type: unicycle}
+    sensors: {lidar: {type: SENSOR, mount: {z_m: 0.5}}}
+steps: 20
+dt_s: 0.1
+"""
+    world.write_text(text.replace("SENSOR", "range_bearing_3d"))
+    made = load_world(world)
+    log = simulate(made, 1)
+    slam = build_slam(made.config(), log)
+    for event in log.events:
+        slam.process(event)
+    assert np.abs(slam.mean(1) - [4.0, 1.0, 2.5]).max() < 0.3
+    world.write_text(text.replace("SENSOR, mount: {z_m: 0.5}", "range_bearing"))
+    with pytest.raises(ConfigError, match="its landmarks are in space"):
+        load_world(world)

@@ -17,6 +17,7 @@ from kalmark.geometry.frames3d import compose
 from kalmark.geometry.rotations import exp
 from kalmark.geometry.spaces import MOUNTS
 from kalmark.models import landmarks
+from kalmark.models.landmark_views import Spatial
 from kalmark.models.observe import expectation, inverse_expectation, linearize, linearize_chain, view_of
 from kalmark.tracks.channel import ObservationModel
 from placed_landmarks import placed
@@ -109,7 +110,8 @@ def test_the_compiled_models_called_by_address_equal_the_written_out_composition
     for _ in range(20):
         head, l, y = drawn(rng, sensor, landmark)
         r, mount, l = head[:7].copy(), head[7:].copy(), l[None]
-        told = SimpleNamespace(expect=lambda v, y=y: sensor.expect(v, y))  # y tells sizes of tags and ends of segments
+        more = (y,) if isinstance(sensor, Spatial) else ()  # sizes of tags and ends of segments
+        told = SimpleNamespace(expect=lambda v, more=more: sensor.expect(v, *more))
         e, E_r, E_s, E_l = expectation(r, mount, told, landmark, l)  # type: ignore[arg-type]
         view = view_of(sensor, landmark, mount)
         assert isinstance(view, tuple), "built-in models take the compiled way"

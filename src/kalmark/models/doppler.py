@@ -15,9 +15,10 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import Positive, declared, register
-from kalmark.geometry.directions import inv_spherical_many, spherical_many
-from kalmark.geometry.frames import inv_scan_many, scan_many
-from kalmark.models.landmark_views import Cone, refuse_negative_ranges, residual
+from kalmark.geometry.directions import spherical_many
+from kalmark.geometry.frames import scan_many
+from kalmark.models.landmark_views import Cone, InPlane, InSpace, refuse_negative_ranges, residual
+from kalmark.models.polar import AzimuthNoise, BearingNoise, ElevationNoise, place_of_polar
 
 __all__ = ["Radar2D", "Radar3D", "RangeRate2D", "RangeRate3D"]
 
@@ -63,8 +64,21 @@ class _Doppler(Cone):
     sees_velocity: ClassVar[bool] = True
 
 
+@declared
+class _Radar(_Doppler):
+    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return points (K, d) and V_y (K, d, m), zero for the rate.  [S] (62)."""
+        return place_of_polar(y, self.point_size)
+
+    def check(self, y: Array) -> None:
+        """Refuse negative ranges."""
+        refuse_negative_ranges(y)
+
+
 @register("sensor", "range_rate")
-class RangeRate2D(_Doppler):
+class RangeRate2D(InPlane, _Doppler):
     """Rate of the range of a landmark that stands still.
 
     It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
@@ -77,13 +91,11 @@ class RangeRate2D(_Doppler):
     array([[-0.8]])
     """
 
-    world = "plane"
-    point_size = 2
     sees_kinds = ("point",)
 
 
 @register("sensor", "range_rate")
-class RangeRate3D(_Doppler):
+class RangeRate3D(InSpace, _Doppler):
     """Rate of the range of a landmark that stands still.
 
     It starts no landmark.  Where the robot has no velocity in its state it is the mean since the last scan.
@@ -97,12 +109,9 @@ class RangeRate3D(_Doppler):
     array([[-0.8]])
     """
 
-    world = "space"
-    sees_kinds = ("point3",)
-
 
 @register("sensor", "radar")
-class Radar2D(_Doppler):
+class Radar2D(InPlane, _Radar):
     """A radar: range, bearing and range rate of a landmark that stands still.
 
     Where the robot has no velocity in its state it is the mean since the last scan.
@@ -115,27 +124,15 @@ class Radar2D(_Doppler):
     array([[ 5.  ,  0.64, -0.8 ]])
     """
 
-    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
-    sigma_bearing_rad: Annotated[Positive, "Noise of the bearing."] = 0.02
+    sigma_bearing_rad: BearingNoise = 0.02
 
-    world = "plane"
-    point_size = 2
     sees_kinds = ("point",)
     columns = ("range_m", "bearing_rad", "range_rate_mps")
     sigmas = ("sigma_range_m", "sigma_bearing_rad", "sigma_rate_mps")
 
-    def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return points (K, 2) and V_y (K, 2, 3), zero for the rate.  [S] (62)."""
-        p, P_y = inv_scan_many(np.ascontiguousarray(y[:, :2]))
-        return p, np.concatenate([P_y, np.zeros((len(y), 2, 1))], axis=2)
-
-    def check(self, y: Array) -> None:
-        """Refuse negative ranges."""
-        refuse_negative_ranges(y)
-
 
 @register("sensor", "radar")
-class Radar3D(_Doppler):
+class Radar3D(InSpace, _Radar):
     """A radar: range, azimuth, elevation and range rate of a landmark that stands still.
 
     Where the robot has no velocity in its state it is the mean since the last scan.
@@ -149,22 +146,10 @@ class Radar3D(_Doppler):
     array([[ 5.  ,  0.64,  0.  , -0.8 ]])
     """
 
-    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.2
-    sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
-    sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
+    sigma_azimuth_rad: AzimuthNoise = 0.02
+    sigma_elevation_rad: ElevationNoise = 0.02
 
-    world = "space"
-    sees_kinds = ("point3",)
     columns = ("range_m", "azimuth_rad", "elevation_rad", "range_rate_mps")
     sigmas = (
         "sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad", "sigma_rate_mps",
     )  # fmt: skip
-
-    def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return points (K, 3) and V_y (K, 3, 4), zero for the rate."""
-        p, P_y = inv_spherical_many(np.ascontiguousarray(y[:, :3]))
-        return p, np.concatenate([P_y, np.zeros((len(y), 3, 1))], axis=2)
-
-    def check(self, y: Array) -> None:
-        """Refuse negative ranges."""
-        refuse_negative_ranges(y)

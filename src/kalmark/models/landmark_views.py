@@ -29,7 +29,6 @@ from kalmark.compiled import by_address, compiled, signature_of
 from kalmark.declare import Limit, NotNegative, Number, Positive, declared
 from kalmark.errors import EventError
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.directions import spherical_many
 from kalmark.models import cameras, landmarks3d, lines, tags
 
 # of the sensor's pose T and landmarks l (K, n): views v (K, d), V_T (K, ., 3 or 6), V_l (K, ., n)
@@ -91,13 +90,6 @@ def components(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tup
     for i in range(k):
         for j in range(m):
             e[i, j], E_v[i, j, code + j] = v[i, code + j] + (par[j] if len(par) > 0 else 0.0), 1.0
-    return e, residual(y, e, angular), E_v
-
-
-@compiled
-def range_bearing(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e, z (K, 3), E_v (K, 3, 3) of ranges, azimuths and elevations of v (K, 3)."""
-    e, E_v = spherical_many(v)
     return e, residual(y, e, angular), E_v
 
 
@@ -178,6 +170,19 @@ def raise_views(v: Array, height: float) -> Array:
     for i in range(k):
         p[i, 0], p[i, 1], p[i, 2] = v[i, 0], v[i, 1], (v[i, 2] if d > 2 else 0.0) - height
     return p
+
+
+@compiled
+def length_of_view(
+    v: Array, i: int, height: float, shift: float, nearest: float
+) -> tuple[float, tuple[float, float, float]]:
+    """Return the distance of view number i of v (K, 2 or 3) from a sensor, and its direction: 0 at no distance.
+
+    The sensor is `height` m above the plane, a receiver of it `shift` m to the right; none is nearer than `nearest`.
+    """
+    x, y, z = v[i, 0], v[i, 1] + shift, (v[i, 2] if v.shape[1] > 2 else 0.0) - height
+    r = math.sqrt(nearest * nearest + x * x + y * y + z * z)
+    return r, ((x / r, y / r, z / r) if r > 0.0 else (0.0, 0.0, 0.0))
 
 
 @compiled
@@ -309,6 +314,20 @@ class Cone(Expecting):
         return inside & (off <= self.fov_rad / 2)
 
 
+class InPlane:
+    """Sensors of the plane: a view begins with two numbers of a point."""
+
+    world: ClassVar[str] = "plane"
+    point_size: ClassVar[int] = 2
+
+
+class InSpace:
+    """Sensors of points of space."""
+
+    world: ClassVar[str] = "space"
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
+
+
 class Distancing(Expecting):
     """Sensors of distances in three dimensions, in either world; their constants end with their height."""
 
@@ -335,7 +354,7 @@ class Raised(Distancing):
     height_m: Annotated[Number, "Of the sensor above the plane of the map."] = 0.0
 
     world = "plane"
-    sees_kinds = ("point", "point_height")
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point", "point_height")
 
     @property
     def height(self) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, Limit, Number, Positive, declared, register
-from kalmark.models.landmark_views import Distancing, Raised, raise_views
+from kalmark.models.landmark_views import Distancing, InSpace, Raised, length_of_view
 
 __all__ = ["RangeDifference2D", "RangeDifference3D", "SignalStrength2D", "SignalStrength3D"]
 
@@ -28,14 +28,12 @@ DECIBELS = 10.0 / math.log(10.0)  # in one unit of a natural logarithm of power
 def strength(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Expect the strength of what is at v (K, d): `par` = (strength at 1 m, exponent, height).  Log-distance."""
     k, d = v.shape
-    p, e, E_v = raise_views(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
+    e, E_v = np.empty((k, 1)), np.empty((k, 1, d))
     for i in range(k):
-        square = NEAREST_M * NEAREST_M
-        for j in range(3):
-            square += p[i, j] * p[i, j]
-        e[i, 0] = par[0] - par[1] * DECIBELS * 0.5 * math.log(square)
+        r, direction = length_of_view(v, i, par[2], 0.0, NEAREST_M)
+        e[i, 0] = par[0] - par[1] * DECIBELS * math.log(r)
         for j in range(d):
-            E_v[i, 0, j] = -par[1] * DECIBELS * p[i, j] / square
+            E_v[i, 0, j] = -par[1] * DECIBELS * direction[j] / r
     return e, y - e, E_v
 
 
@@ -52,17 +50,13 @@ def by_path_loss(code: int, par: Array, angular: Flags, v: Array, e: Array) -> A
 def range_difference(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Expect how much farther v (K, d) is from the right receiver than the left one; `par` = (baseline, height)."""
     k, d = v.shape
-    p, e, E_v = raise_views(v, par[1]), np.zeros((k, 1)), np.zeros((k, 1, d))
-    for i in range(k):
-        for sign in (1.0, -1.0):  # the right receiver is at y = -par / 2
-            square = NEAREST_M * NEAREST_M
-            for j in range(3):
-                x = p[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)
-                square += x * x
-            distance = math.sqrt(square)
-            e[i, 0] += sign * distance
-            for j in range(d):
-                E_v[i, 0, j] += sign * (p[i, j] + (sign * 0.5 * par[0] if j == 1 else 0.0)) / distance
+    e, E_v = np.empty((k, 1)), np.empty((k, 1, d))
+    for i in range(k):  # the right receiver is at y = -par / 2
+        right, to_right = length_of_view(v, i, par[1], 0.5 * par[0], NEAREST_M)
+        left, to_left = length_of_view(v, i, par[1], -0.5 * par[0], NEAREST_M)
+        e[i, 0] = right - left
+        for j in range(d):
+            E_v[i, 0, j] = to_right[j] - to_left[j]
     return e, y - e, E_v
 
 
@@ -130,7 +124,7 @@ class SignalStrength2D(_SignalStrength, Raised):
 
 
 @register("sensor", "signal_strength")
-class SignalStrength3D(_SignalStrength):
+class SignalStrength3D(InSpace, _SignalStrength):
     """Received signal strength of a landmark that sends, by the log-distance path loss.
 
     >>> own = km.Mount(km.sensors.SignalStrength3D(strength_dbm=-40.0, exponent=2.0))
@@ -139,9 +133,6 @@ class SignalStrength3D(_SignalStrength):
     >>> slam.expect("drone", "own").e.round(2)
     array([[-60.]])
     """
-
-    world = "space"
-    sees_kinds = ("point3",)
 
 
 @declared
@@ -173,7 +164,7 @@ class RangeDifference2D(_RangeDifference, Raised):
 
 
 @register("sensor", "range_difference")
-class RangeDifference3D(_RangeDifference):
+class RangeDifference3D(InSpace, _RangeDifference):
     """Time difference of arrival at two receivers, times the speed of light or sound: right less left.
 
     >>> own = km.Mount(km.sensors.RangeDifference3D(baseline_m=0.5))
@@ -182,6 +173,3 @@ class RangeDifference3D(_RangeDifference):
     >>> slam.expect("drone", "own").e.round(2)
     array([[0.29]])
     """
-
-    world = "space"
-    sees_kinds = ("point3",)

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 from kalmark.declare import built_in
-from kalmark.models import blocks, doppler, radio, state_sensors, planar, spatial, imaging
+from kalmark.models import blocks, doppler, radio, state_sensors, polar, spatial, imaging
 from kalmark.models.blocks import *
 from kalmark.models.doppler import *
 from kalmark.models.radio import *
 from kalmark.models.state_sensors import *
-from kalmark.models.planar import *
+from kalmark.models.polar import *
 from kalmark.models.spatial import *
 from kalmark.models.imaging import *
 
@@ -17,7 +17,7 @@ __all__ = (
     blocks.__all__
     + doppler.__all__
     + imaging.__all__
-    + planar.__all__
+    + polar.__all__
     + radio.__all__
     + spatial.__all__
     + state_sensors.__all__

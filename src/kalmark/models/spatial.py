@@ -1,4 +1,4 @@
-"""Sensors of space that look along x, x forward, y left, z up; and the one of walls in the plane."""
+"""Sensors of positions, in plane and space, of poses of tags and of walls; x is forward, y left, z up."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from kalmark.arrays import Array, Flags
 from kalmark.declare import Limit, NotNegative, Positive, register
 from kalmark.errors import EventError
 from kalmark.events import unit_quaternion
-from kalmark.geometry.directions import inv_spherical_many
 from kalmark.models import landmark_views, walls
-from kalmark.models.landmark_views import Cone, Spatial, refuse_negative_ranges
+from kalmark.models.landmark_views import Cone, InPlane, InSpace, Spatial
 
-__all__ = ["Position3D", "RangeBearing3D", "TagPose", "Wall"]
+__all__ = ["Position2D", "Position3D", "TagPose", "Wall"]
 
 
 @register("sensor", "wall")
@@ -75,36 +74,38 @@ class Wall(Spatial):
                 raise EventError(f"observation {i}: right_m is {row[2]}, expected less than left_m, {row[3]}")
 
 
-@register("sensor", "range_bearing_3d")
-class RangeBearing3D(Cone, Spatial):
-    """Distance, azimuth and elevation of a landmark; x is forward, z up: a 3-D laser, a radar.
+class _Position(Cone):
+    """Sensors of positions."""
 
-    >>> lidar = km.Mount(km.sensors.RangeBearing3D())
-    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"lidar": lidar}))
-    >>> report = slam.process(km.Scan(0.0, "drone", "lidar", [[5.0, 0.0, 0.6435]], ids=[7]))
-    >>> slam.mean(7).round(2)
-    array([4., 0., 3.])
-    """
-
-    sigma_range_m: Annotated[Positive, "Noise of the range."] = 0.1
-    sigma_azimuth_rad: Annotated[Positive, "Noise of the azimuth."] = 0.02
-    sigma_elevation_rad: Annotated[Positive, "Noise of the elevation."] = 0.02
-
-    expected = landmark_views.range_bearing
-    columns = ("range_m", "azimuth_rad", "elevation_rad")
-    sigmas = ("sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad")
+    expected = landmark_views.components
 
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return points v (K, 3) and V_y (K, 3, 3)."""
-        return inv_spherical_many(np.ascontiguousarray(y))
+        """Return the points (K, d) and the identities (K, d, d)."""
+        return y.copy(), np.tile(np.eye(y.shape[1]), (len(y), 1, 1))
 
-    def check(self, y: Array) -> None:
-        """Refuse negative ranges in y (K, 3)."""
-        refuse_negative_ranges(y)
+
+@register("sensor", "position")
+class Position2D(InPlane, _Position):
+    """Position of a landmark (x, y) in the sensor's frame.
+
+    [F]'s second measurement model.
+
+    >>> camera = km.Mount(km.sensors.Position2D(), at=(0.0, 0.0, 1.5708))
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"camera": camera}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "camera", [[2.0, 0.0]], ids=["post"]))
+    >>> slam.mean("post").round(3)  # to the left, as the sensor looks
+    array([-0.,  2.])
+    """
+
+    sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1
+    sigma_y_m: Annotated[Positive, "Noise, to the left."] = 0.1
+
+    columns = ("x_m", "y_m")
+    sigmas = ("sigma_x_m", "sigma_y_m")
 
 
 @register("sensor", "position_3d")
-class Position3D(Cone, Spatial):
+class Position3D(InSpace, _Position):
     """Position of a landmark (x, y, z) in the sensor's frame; x is forward, z up: an RGB-D camera, a lidar.
 
     >>> camera = km.Mount(km.sensors.Position3D(), at=(0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0))
@@ -118,13 +119,8 @@ class Position3D(Cone, Spatial):
     sigma_y_m: Annotated[Positive, "Noise, along y."] = 0.1
     sigma_z_m: Annotated[Positive, "Noise, along z."] = 0.1
 
-    expected = landmark_views.components
     columns = ("x_m", "y_m", "z_m")
     sigmas = ("sigma_x_m", "sigma_y_m", "sigma_z_m")
-
-    def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return the points (K, 3) and the identities (K, 3, 3)."""
-        return y.copy(), np.tile(np.eye(3), (len(y), 1, 1))
 
 
 @register("sensor", "tag_pose")

@@ -75,9 +75,9 @@ class Scenery:
 
     @property
     def of_space(self) -> bool:
-        """True if it cannot be in the plane."""
+        """True if it cannot be in the plane, but for points at heights."""
         solid = bool(len(self.segments)) and self.segments.shape[1] == 6
-        return self.points.shape[1] == 3 or solid or bool(len(self.tags)) or self.raw_of is not None
+        return solid or bool(len(self.tags)) or self.raw_of is not None
 
 
 class LayoutSection(Section):

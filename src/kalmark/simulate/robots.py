@@ -353,14 +353,8 @@ def sensor_scans(
             y = laser.beams(carried.laser, carried.sensing, carried.frames[k], things, chance.sight)
             if len(y):
                 yield k, name, y, None, (None,) * len(y)
-        elif measures_blocks(carried.sensor):
-            yield from readings_between(robot, name, k, robots, things, chance)
         elif isinstance(carried.sensor, OfState):
-            read, ids = reading(robot, carried, k, world.dt_s, chance), None
-            if carried.sensing.loop_reach_m is not None:
-                read, ids = with_loop(robot, carried, k, world.dt_s, read, chance)
-            if read is not None:
-                yield k, name, read, ids, (robot.name,) * len(read)
+            yield from own_readings(robot, name, k, robots, things, world.dt_s, chance)
         else:
             for seen in sight(carried, robot, robots, things, world, at, chance):
                 told, real = ([names.get(i, i) for i in part.tolist()] for part in (seen.ids, seen.real))
@@ -440,6 +434,21 @@ def reading(robot: SimRobot, carried: SimSensor, k: int, dt_s: float, chance: Ch
         carried.last = last if counts else carried.last
         return None
     return None if counts and last is None else y
+
+
+def own_readings(
+    robot: SimRobot, name: str, k: int, robots: list[SimRobot], things: dict[str, Things], dt_s: float, chance: Chance
+) -> Iterator[Found]:
+    """Yield what a sensor of the state, or of blocks, measures at step k, if all of it is not left out."""
+    carried = robot.sensors[name]
+    if measures_blocks(carried.sensor):
+        yield from readings_between(robot, name, k, robots, things, chance)
+        return
+    read, ids = reading(robot, carried, k, dt_s, chance), None
+    if carried.sensing.loop_reach_m is not None:
+        read, ids = with_loop(robot, carried, k, dt_s, read, chance)
+    if read is not None:
+        yield k, name, read, ids, (robot.name,) * len(read)
 
 
 def readings_between(

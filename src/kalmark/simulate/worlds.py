@@ -28,6 +28,8 @@ from kalmark.config.schema import (
 from kalmark.config.sections import Section, model_of, unexpected_value
 from kalmark.config.tree import Tree, merge_trees, read_tree
 from kalmark.declare import Count, Positive
+from kalmark.models.landmarks import PointHeight2D
+from kalmark.models.protocols import sees_kinds
 from kalmark.plugins import entry_points_of
 from kalmark.simulate.layouts import Layout
 from kalmark.simulate.routes import Constant, Route, Waypoints
@@ -129,7 +131,8 @@ class World(OfFile):
                     raise unexpected_value(f"images in a world that has them: {worlds}")
                 if (kind := robot.sensors[sensor].type) not in of:
                     raise unexpected_value(f"images of {' or '.join(of)}, not of {sensor!r}, a {kind}")
-        if self.dimensions == 2 and self.world.scenery(np.random.default_rng(0)).of_space:
+        scenery = self.world.scenery(np.random.default_rng(0))
+        if self.dimensions == 2 and (scenery.of_space or (scenery.points.shape[1] == 3 and not self._sees_heights)):
             raise unexpected_value("robots of space, or a world of the plane: its landmarks are in space")
         return self
 
@@ -137,6 +140,11 @@ class World(OfFile):
     def dimensions(self) -> int:
         """2 in the plane, 3 in space."""
         return 3 if isinstance(next(iter(self.robots.values())), SpaceSimulatedRobot) else 2
+
+    @property
+    def _sees_heights(self) -> bool:
+        sensors = [sensor for robot in self.robots.values() for sensor in robot.sensors.values()]
+        return any(PointHeight2D.kind in (sees_kinds(model_of(sensor)) or ()) for sensor in sensors)
 
     @property
     def has_signatures(self) -> bool:

@@ -20,7 +20,17 @@ from kalmark.filter.nearest_blocks import has_place
 from kalmark.geometry.gaussian import gate
 from kalmark.models import landmarks as kinds
 from kalmark.models import protocols
-from kalmark.models.landmarks import AsPoint, InverseDepth2D, Point2D, Point3D, PointSignature2D, Polar2D, Tag, Wall2D
+from kalmark.models.landmarks import (
+    AsPoint,
+    InverseDepth2D,
+    Point2D,
+    Point3D,
+    PointHeight2D,
+    PointSignature2D,
+    Polar2D,
+    Tag,
+    Wall2D,
+)
 from kalmark.models.observe import MOUNTS_AGO, is_built_in, landmark_at, linearize, sensor_pose, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
@@ -356,8 +366,10 @@ def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool)
     if "size_m" in sensor.columns or "qw" in sensor.columns:
         return Tag()
     if len(at) == 3:
-        if sees_kinds(sensor) == (Wall2D.kind,):
-            return Wall2D()
+        alone: dict[tuple[str, ...], Any] = {(Wall2D.kind,): Wall2D, (PointHeight2D.kind,): PointHeight2D}
+        if (only := alone.get(sees_kinds(sensor) or ())) is not None:
+            made: Landmark = only()
+            return made
         if not finds_depth(sensor) and not delayed:
             return InverseDepth2D()
         if "signature" in sensor.columns:

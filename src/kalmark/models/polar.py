@@ -1,11 +1,11 @@
-"""Sensors of the plane: each measures something at v = (x, y[, signature]) in its frame.  [S] A.4, Table 2.
+"""Sensors of ranges and directions, in plane and space: each measures something at v in its frame.  [S] A.4, Table 2.
 
-A range alone has the same equation in space and to a landmark at another height: r = |v|, v with three numbers.
+In the plane v is (x, y[, signature]), with a height (x, y, z), in space (x, y, z) or a ray with its inverse distance.
+The numbers of a place are range and bearing in the plane, range, azimuth and elevation in three dimensions.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import KW_ONLY, replace
 from functools import cached_property
 from typing import Annotated, ClassVar, Self
@@ -15,44 +15,72 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, NotNegative, Number, Positive, declared, refuse, register
+from kalmark.geometry.directions import inv_spherical_many, spherical_many
 from kalmark.geometry.frames import inv_scan_many, scan_many
 from kalmark.geometry.gaussian import intersection
-from kalmark.models import landmark_views
-from kalmark.models.landmark_views import Cone, Distancing, Expecting, Raised, raise_views, refuse_negative_ranges
+from kalmark.models.landmark_views import (
+    Cone,
+    Distancing,
+    Expecting,
+    InPlane,
+    InSpace,
+    Raised,
+    length_of_view,
+    raise_views,
+    refuse_negative_ranges,
+    residual,
+)
 
-__all__ = ["Bearing", "Position2D", "Range", "Range3D", "RangeBearing", "RangeBearingSignature"]
+__all__ = [
+    "Bearing", "Bearing3D", "Range", "Range3D", "RangeBearing", "RangeBearing3D", "RangeBearingHeight",
+    "RangeBearingSignature",
+]  # fmt: skip
 
-RANGE_BEARING, BEARING, RANGE_BEARING_SIGNATURE = range(1, 4)  # codes of the sensors
 BearingNoise = Annotated[Positive, "Noise of the bearing."]
+AzimuthNoise = Annotated[Positive, "Noise of the azimuth."]
+ElevationNoise = Annotated[Positive, "Noise of the elevation."]
 
 
 @compiled
-def measured_in_plane(code: int, v: Array) -> tuple[Array, Array]:
-    """Return the measurements (K, m) that the built-in sensor `code` makes of v (K, d), and E_v (K, m, d)."""
-    k, d = v.shape
-    y, Y_p = scan_many(v)
-    first = 1 if code == BEARING else 0
-    m = 2 - first + (1 if code == RANGE_BEARING_SIGNATURE else 0)
-    e, E_v = np.empty((k, m)), np.zeros((k, m, d))
+def polar(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Expect range and angles of v (K, n) by the `code`, 4 d + first: of d numbers of a place those from `first` on.
+
+    A signature, behind these in v, follows.  `par` are gain and offset of the range, if it is measured, and the height
+    of the sensor, if it is raised.  Returns e (K, m), the innovations z (K, m) of y (K, m), and E_v (K, m, n).
+    """
+    d, n, m = code // 4, v.shape[1], y.shape[1]
+    e, E_v = scan_many(v) if d == 2 else spherical_many(raise_views(v, par[2]) if len(par) > 2 else v)
+    if m != d or n != d:
+        e, E_v = some_numbers(v, e, E_v, code % 4, m)
+    if len(par) > 0 and (par[0] != 1.0 or par[1] != 0.0):
+        for i in range(len(v)):
+            e[i, 0] = (e[i, 0] + par[1]) / par[0]
+            for b in range(n):
+                E_v[i, 0, b] /= par[0]
+    return e, residual(y, e, angular), E_v
+
+
+@compiled
+def some_numbers(v: Array, place: Array, P_v: Array, first: int, m: int) -> tuple[Array, Array]:
+    """Return m numbers e (K, m) of a place (K, d), and E_v (K, m, n), from `first` on, then those of v (K, n)."""
+    (k, n), d = v.shape, place.shape[1]
+    e, E_v, numbers = np.empty((k, m)), np.zeros((k, m, n)), min(d, n)
     for i in range(k):
-        for j in range(first, 2):
-            e[i, j - first] = y[i, j]
-            E_v[i, j - first, 0], E_v[i, j - first, 1] = Y_p[i, j, 0], Y_p[i, j, 1]
-        if code == RANGE_BEARING_SIGNATURE:
-            e[i, 2], E_v[i, 2, 2] = v[i, 2], 1.0
+        for j in range(m):
+            a = first + j
+            if a < d:
+                e[i, j] = place[i, a]
+                for b in range(numbers):
+                    E_v[i, j, b] = P_v[i, a, b]
+            else:
+                e[i, j], E_v[i, j, a] = v[i, a], 1.0
     return e, E_v
 
 
-@compiled
-def in_plane(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Return e (K, m), the innovations z (K, m) of y (K, m), and E_v (K, m, d)."""
-    e, E_v = measured_in_plane(code, v)
-    if len(par) == 2:  # gain and offset of the range
-        for i in range(len(e)):
-            e[i, 0] = (e[i, 0] + par[1]) / par[0]
-            for j in range(E_v.shape[2]):
-                E_v[i, 0, j] /= par[0]
-    return e, landmark_views.residual(y, e, angular), E_v
+def place_of_polar(y: Array, d: int) -> tuple[Array, Array]:
+    """Return the places (K, d) at ranges and angles, the first d of y (K, m), and V_y (K, d, m).  [S] (62)."""
+    p, P_y = (inv_scan_many if d == 2 else inv_spherical_many)(np.ascontiguousarray(y[:, :d]))
+    return p, np.concatenate([P_y, np.zeros((len(y), d, y.shape[1] - d))], axis=2)
 
 
 @compiled
@@ -62,12 +90,12 @@ def distance(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple
     At v = 0, where a range has no derivative, E_v is 0.
     """
     k, d = v.shape
-    p, e, E_v = raise_views(v, par[2]), np.empty((k, 1)), np.zeros((k, 1, d))
+    e, E_v = np.empty((k, 1)), np.empty((k, 1, d))
     for i in range(k):
-        r = math.sqrt(p[i, 0] * p[i, 0] + p[i, 1] * p[i, 1] + p[i, 2] * p[i, 2])
+        r, direction = length_of_view(v, i, par[2], 0.0, 0.0)
         e[i, 0] = (r + par[1]) / par[0]
-        for j in range(d if r > 0.0 else 0):
-            E_v[i, 0, j] = p[i, j] / r / par[0]
+        for j in range(d):
+            E_v[i, 0, j] = direction[j] / par[0]
     return e, y - e, E_v
 
 
@@ -95,13 +123,11 @@ def range_noise(numbers: Array, e: Array) -> Array:
     return R
 
 
-class _Planar(Cone):
-    """Base of the planar sensors: limits of range, built-in expectation."""
+class _Polar(Cone):
+    """Base of the sensors of directions: limits of range, built-in expectation."""
 
-    world = "plane"
-    expected = in_plane
+    expected = polar
     code: ClassVar[int]
-    point_size = 2
 
 
 @declared
@@ -179,22 +205,22 @@ class _Ranging(Expecting):
         refuse_negative_ranges(y)
 
 
-class _RangingBearing(_Ranging, _Planar):
-    """Sensors of the plane whose first components are a range and a bearing."""
+class _Placing(_Ranging, _Polar):
+    """Sensors of a range and all angles, which start landmarks."""
 
-    def points(self, y: Array) -> tuple[Array, Array]:
-        """Return the points (K, 2) that ranges and bearings y (K, 2) stand for, and V_y (K, 2, 2).  [S] (62)."""
-        measured = y[:, :2].copy()
-        if self.scale == 1.0 and self.bias_m == 0.0:
-            return inv_scan_many(measured)
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return what is at v (K, d or more), and V_y (K, ., m): places, and what is measured beside.  [S] (62)."""
+        d, k = self.point_size, y.shape[1]
+        measured = y.copy()
         measured[:, 0] = self.distances(y)
-        p, P_y = inv_scan_many(measured)
+        p, P_y = place_of_polar(measured, d)
         P_y[:, :, 0] /= self.scale
-        return p, P_y
+        beside = np.tile(np.eye(k)[d:], (len(y), 1, 1))
+        return np.column_stack([p, y[:, d:]]), np.concatenate([P_y, beside], axis=1)
 
 
 @register("sensor", "range_bearing")
-class RangeBearing(_RangingBearing):
+class RangeBearing(InPlane, _Placing):
     """Distance and direction of a landmark: a laser.
 
     sigma_range^2 = sigma_range_m^2 + (sigma_range_rel range)^2.  [S] (61).
@@ -208,17 +234,70 @@ class RangeBearing(_RangingBearing):
 
     sigma_bearing_rad: BearingNoise = 0.02
 
-    code = RANGE_BEARING
+    code = 8
     columns = ("range_m", "bearing_rad")
     sigmas = ("sigma_range_m", "sigma_bearing_rad")
 
+
+@declared
+class _InThree(_Placing):
+    sigma_azimuth_rad: AzimuthNoise = 0.02
+    sigma_elevation_rad: ElevationNoise = 0.02
+
+    code = 12
+    columns = ("range_m", "azimuth_rad", "elevation_rad")
+    sigmas = ("sigma_range_m", "sigma_azimuth_rad", "sigma_elevation_rad")
+
+
+@register("sensor", "range_bearing_3d")
+class RangeBearing3D(InSpace, _InThree):
+    """Distance, azimuth and elevation of a landmark; x is forward, z up: a 3-D laser, a radar.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearing3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"lidar": lidar}))
+    >>> report = slam.process(km.Scan(0.0, "drone", "lidar", [[5.0, 0.0, 0.6435]], ids=[7]))
+    >>> slam.mean(7).round(2)
+    array([4., 0., 3.])
+    """
+
+
+@register("sensor", "range_bearing_3d")
+class RangeBearingHeight(_InThree, Raised):
+    """Distance, azimuth and elevation of a landmark at a height, seen by a robot of the plane; x is forward, z up.
+
+    >>> lidar = km.Mount(km.sensors.RangeBearingHeight())
+    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"lidar": lidar}))
+    >>> report = slam.process(km.Scan(0.0, "rover", "lidar", [[5.0, 0.0, 0.6435]], ids=[7]))
+    >>> slam.mean(7).round(2)
+    array([4., 0., 3.])
+    """
+
+    sees_kinds: ClassVar[tuple[str, ...]] = ("point_height",)
+
+    def sees(self, v: Array) -> Flags:
+        """Return which of v (K, 2 or 3) lie within the range limits and the cone of sight about x."""
+        return super().sees(self.risen(v))
+
     def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return points v (K, 2) and V_y (K, 2, 2).  [S] (62)."""
-        return self.points(y)
+        """Return points v (K, 3), at their height above the plane, and V_y (K, 3, 3)."""
+        v, V_y = super().invert(y)
+        v[:, 2] += self.height_m
+        return v, V_y
+
+
+class _Directing(_Polar):
+    """Sensors of all angles and no range."""
+
+    finds_depth = False
+
+    def invert(self, y: Array) -> tuple[Array, Array]:
+        """Return rays v (K, d) of length 1 and V_y (K, d, m)."""
+        v, V_y = place_of_polar(np.column_stack([np.ones(len(y)), y]), self.point_size)
+        return v, V_y[:, :, 1:]
 
 
 @register("sensor", "bearing")
-class Bearing(_Planar):
+class Bearing(InPlane, _Directing):
     """Direction of a landmark: a camera, a radio direction finder.
 
     >>> eye = km.Mount(km.sensors.Bearing(sigma_bearing_rad=0.01))
@@ -230,22 +309,36 @@ class Bearing(_Planar):
 
     sigma_bearing_rad: BearingNoise = 0.02
 
-    code = BEARING
+    code = 9
     columns = ("bearing_rad",)
     sigmas = ("sigma_bearing_rad",)
-    finds_depth = False
     sees_kinds = ("point", "inverse_depth_2d")
-
-    def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return rays v (K, 2) of length 1 and V_y (K, 2, 1)."""
-        c, s = np.cos(y), np.sin(y)
-        return np.hstack([c, s]), np.stack([-s, c], axis=1)
 
     def meet(self, T: Array, y: Array, y2: Array) -> Array:
         """Return where the rays y (K, 1) from the origin and y2 (K, 1) from T meet: (K, 1, 2), NaN if nowhere."""
         at_origin = np.column_stack([np.zeros((len(y), 2)), y])
         at_T = np.column_stack([np.tile(T[:2], (len(y2), 1)), T[2] + y2])
         return intersection(at_origin, at_T)[0][:, None]
+
+
+@register("sensor", "bearing")
+class Bearing3D(InSpace, _Directing):
+    """Direction of a landmark, azimuth and elevation; x is forward, z up: a theodolite, an antenna array.
+
+    >>> eye = km.Mount(km.sensors.Bearing3D())
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> slam.add_landmark("a", (4.0, 3.0, 0.0), 0.01 * np.eye(3), km.landmarks.Point3D())
+    >>> slam.expect("drone", "eye").e.round(2)
+    array([[0.64, 0.  ]])
+    """
+
+    sigma_azimuth_rad: AzimuthNoise = 0.02
+    sigma_elevation_rad: ElevationNoise = 0.02
+
+    code = 13
+    columns = ("azimuth_rad", "elevation_rad")
+    sigmas = ("sigma_azimuth_rad", "sigma_elevation_rad")
+    sees_kinds = ("point3", "inverse_depth", "anchored_homogeneous", "homogeneous")
 
 
 @declared
@@ -280,7 +373,7 @@ class Range(_Range, Raised):
 
 
 @register("sensor", "range")
-class Range3D(_Range):
+class Range3D(InSpace, _Range):
     """Distance to a landmark: a radio beacon, a sonar with a wide lobe.
 
     >>> own = km.Mount(km.sensors.Range3D(sigma_range_m=0.1))
@@ -290,38 +383,9 @@ class Range3D(_Range):
     array([[13.]])
     """
 
-    world = "space"
-    sees_kinds = ("point3",)
-
-
-@register("sensor", "position")
-class Position2D(_Planar):
-    """Position of a landmark (x, y) in the sensor's frame.
-
-    [F]'s second measurement model.
-
-    >>> camera = km.Mount(km.sensors.Position2D(), at=(0.0, 0.0, 1.5708))
-    >>> slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), sensors={"camera": camera}))
-    >>> report = slam.process(km.Scan(0.0, "rover", "camera", [[2.0, 0.0]], ids=["post"]))
-    >>> slam.mean("post").round(3)  # to the left, as the sensor looks
-    array([-0.,  2.])
-    """
-
-    sigma_x_m: Annotated[Positive, "Noise, forward."] = 0.1
-    sigma_y_m: Annotated[Positive, "Noise, to the left."] = 0.1
-
-    code = 0
-    expected = landmark_views.components
-    columns = ("x_m", "y_m")
-    sigmas = ("sigma_x_m", "sigma_y_m")
-
-    def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return the points (K, 2) and the identities (K, 2, 2)."""
-        return y.copy(), np.tile(np.eye(2), (len(y), 1, 1))
-
 
 @register("sensor", "range_bearing_signature")
-class RangeBearingSignature(_RangingBearing):
+class RangeBearingSignature(InPlane, _Placing):
     """Distance, direction and signature of a landmark, a number that differs from landmark to landmark.
 
     [T] 3: a landmark is (x, y, s).
@@ -336,13 +400,6 @@ class RangeBearingSignature(_RangingBearing):
     sigma_bearing_rad: BearingNoise = 0.02
     sigma_signature: Annotated[Positive, "Noise of the signature."] = 0.1
 
-    code = RANGE_BEARING_SIGNATURE
+    code = 8
     columns = ("range_m", "bearing_rad", "signature")
     sigmas = ("sigma_range_m", "sigma_bearing_rad", "sigma_signature")
-
-    def invert(self, y: Array) -> tuple[Array, Array]:
-        """Return (x, y, signature) (K, 3) and V_y (K, 3, 3)."""
-        p, P_y = self.points(y)
-        V_y = np.zeros((len(y), 3, 3))
-        V_y[:, :2, :2], V_y[:, 2, 2] = P_y, 1.0
-        return np.column_stack([p, y[:, 2]]), V_y
