@@ -140,10 +140,17 @@ def test_trees_that_were_felled_do_not_carry_a_robot() -> None:
     assert off.max() < 0.8
 
 
-def test_the_onset_is_found_although_the_way_led_through_an_empty_place_first() -> None:
-    """A car spins by 2 rad, maps 100 cones again where there are none, and only then misses those that are there."""
+@pytest.mark.parametrize("repeats", ["off", "merge"])
+def test_the_onset_is_found_although_the_way_led_through_an_empty_place_first(repeats: str) -> None:
+    """A car spins by 2 rad, maps 100 cones again where there are none, and only then misses those that are there.
+
+    Or it is placed before by the shape of what it maps again.
+    """
     log = simulate(load_world("race_track"), 0)
-    slam, carried = build_slam(load_world("race_track", ["filter.upkeep.repeats=off"]).config(), log), list[Any]()
+    slam, carried = (
+        build_slam(load_world("race_track", [f"filter.upkeep.repeats={repeats}"]).config(), log),
+        list[Any](),
+    )
     for event in log:
         during = 55.0 <= event.t_s < 57.0
         if isinstance(event, km.Control) and during:

@@ -22,7 +22,6 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index, block_diagonal
 from kalmark.association.ratio import log_ratios
-from kalmark.association.relocalization import align_points
 from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.geometry.angles import rotation
@@ -267,7 +266,7 @@ def _grown(look: _RepeatCandidates, T: Array, pairs: Index) -> _Constellation:
         if free.sum() < 3:
             break
         pairs = np.column_stack([a[free], b[free]])
-        T = align_points(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(len(pairs)))
+        (T,) = _transforms(look.places[None, pairs[:, 0]], look.places[None, pairs[:, 1]])
         now = {*map(tuple, pairs.tolist())}
         if now == before:
             break
@@ -287,7 +286,7 @@ def _matched(look: _RepeatCandidates, T: Array, pairs: Index, of: Flags, others:
     spread = math.sqrt(float(((look.places[pairs[:, 0]] - middle) ** 2).sum()))
     lever = np.linalg.norm(look.places - middle, axis=1) / max(spread, look.tolerance)
     reach = look.tolerance * (1.0 + lever)
-    far, onto = look.tree.query(from_frame(T, look.places)[0])
+    far, onto = look.tree.query(_moved(T[None], look.places)[0])
     a = np.flatnonzero(of & others[onto] & (far <= reach) & (reach <= LOOSE * look.spacing + look.tolerance))
     a = a[np.argsort(far[a], kind="stable")]
     b, first = np.unique(onto[a], return_index=True)
@@ -310,7 +309,7 @@ def _missing(look: _RepeatCandidates, T: Array, pairs: Index) -> int:
     rest = np.ones(len(sides), dtype=np.bool_)
     rest[pairs.ravel()] = False
     hull = look.places[pairs[:, 1]]
-    alone = [from_frame(T, look.places[rest & (sides > 0)])[0], look.places[rest & (sides < 0)]]
+    alone = [_moved(T[None], look.places[rest & (sides > 0)])[0], look.places[rest & (sides < 0)]]
     return int(_inside(hull, np.concatenate(alone)).sum())
 
 
@@ -359,7 +358,7 @@ def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constell
     pairs = found.pairs
     if np.median(pairs[:, 0]) > np.median(pairs[:, 1]):  # the order of landmarks is that of their age
         pairs = pairs[:, ::-1]
-    T = align_points(look.places[pairs[:, 0]], look.places[pairs[:, 1]], np.ones(k))
+    (T,) = _transforms(look.places[None, pairs[:, 0]], look.places[None, pairs[:, 1]])
     back = np.linalg.norm(from_frame(T, look.places[pairs[:, 1]])[0] - look.places[pairs[:, 0]], axis=1)
     if np.median(back) <= look.spacing / 2:  # each part is the other one turned: the world is symmetric
         return None

@@ -297,6 +297,12 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
         del tracks.tentative[track.id]
     state.clones.forget_current(robot)
     state.moving[robot].left_out.clear()
+    report_found(state, scan, of.since_ns, before)
+
+
+def report_found(state: State, scan: ScanContext, since_ns: int, before: Array) -> None:
+    """Report that a robot, elsewhere since a time, has been moved from `before`; forget the evidence of that."""
+    robot, after, d = scan.event.robot, state.map.mean(scan.robot), scan.dimensions
     for others in (state.pose_hypotheses, state.sums, state.evidence):
         others.pop(robot, None)
     if not scan.adrift:  # else the gap since which it is has been reported
@@ -306,7 +312,7 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
             else float(np.linalg.norm(frames3d.minus(after[:7], before[:7])[3:]))
         )
         moved = math.dist(after[:d], before[:d])
-        scan.report.gaps += (Gap(robot, ELSEWHERE, of.since_ns, scan.event.t_ns, moved, turned),)
+        scan.report.gaps += (Gap(robot, ELSEWHERE, since_ns, scan.event.t_ns, moved, turned),)
 
 
 def _mapped_again(

@@ -15,6 +15,7 @@ from kalmark.management import merge, wall_growth
 from kalmark.management import repeated_places as of_map
 from kalmark.models.protocols import Joining
 from kalmark.report import Repeat
+from kalmark.slam import elsewhere
 from kalmark.slam.factors import update_by_blocks
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
@@ -116,8 +117,8 @@ def search_repeats(state: State, scan: ScanContext, policy: Policy) -> None:
 def _displace(state: State, scan: ScanContext, repeat: Repeat) -> bool:
     """Move the newer part of a repeat, of an error that is unknown until now, onto the older one.
 
-    It has the robot and all that it has not finished if it is there.  Not with several robots, nor where blocks
-    of the map may belong to either part.
+    It has the robot and all that it has not finished if it is there: the robot was elsewhere since that part began.
+    Not with several robots, nor where blocks of the map may belong to either part.
     """
     inside = of_map.is_in(repeat.newer, state.tracks)
     if len(state.robots) > 1 or inside is None or state.tracks.pending:
@@ -130,8 +131,12 @@ def _displace(state: State, scan: ScanContext, repeat: Repeat) -> bool:
         moved = of_map.displacement(state.map, slots, repeat)
     except np.linalg.LinAlgError:
         return False
-    rows = state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots))
+    rows, before = state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots)), state.map.mean(scan.robot)
     state.map.predict(rows, moved.F, moved.Q)
     for slot, mean in zip(moved.slots, moved.means, strict=True):
         state.map.set_predicted(slot, mean)
+    of = state.evidence.get(scan.event.robot)
+    if inside and of is not None:
+        since_ns = min((of.seen[name][0] for name in repeat.newer if name in of.seen), default=scan.event.t_ns)
+        elsewhere.report_found(state, scan, since_ns, before)
     return True
