@@ -290,7 +290,7 @@ def traced() -> dict[str, int]:
 def against_limits(text: str, found: dict[str, int]) -> list[str]:
     """Return a line for each count that is not within its limit in a text, above or too far below."""
     limits, wrong = {row["name"]: int(row["limit"]) for row in ROW.finditer(text)}, []
-    for name, number in found.items():
+    for name, number in (dict.fromkeys(limits, 0) | found).items():
         if name not in limits or number > limits[name]:
             wrong.append(f"{name}: {number}, at most {limits.get(name)}: remove some, or raise it with the reason")
         elif number < limits[name] * (1 - SLACK) - 1:
@@ -303,7 +303,7 @@ def lowered(text: str, found: dict[str, int]) -> str:
 
     def row(old: re.Match[str]) -> str:
         name, limit = old["name"], int(old["limit"])
-        return f"| {name} | {min(limit, found.get(name, limit))} |{old['why']}|"
+        return f"| {name} | {min(limit, found.get(name, 0))} |{old['why']}|"
 
     return ROW.sub(row, text)
 

@@ -23,6 +23,7 @@ from kalmark import declare
 from kalmark.cli.app import app
 from kalmark.declare import built_in, is_own, registered_name, world_of_class
 from kalmark.logs import known_formats
+from kalmark.models import protocols
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -123,9 +124,9 @@ def test_pages_call_kalmark_and_python_as_the_readme_says_once_the_environment_i
 
 
 ROLES = {  # what a row of CONTRIBUTING is about, and where that is
-    "a sensor in the plane": lambda: [one for one in classes_of("sensor", "plane") if not of_state(one)],
-    "a sensor in space": lambda: [one for one in classes_of("sensor", "space") if not of_state(one)],
-    "a sensor of the robot itself": lambda: [one for one in classes_of("sensor") if of_state(one)],
+    "a sensor in plane or space": lambda: [one for one in classes_of("sensor") if not hasattr(one, "views")],
+    "a sensor of the robot itself": lambda: sensors_that_view(protocols.POSE, protocols.CHANGE, protocols.TWIST),
+    "a sensor between robots and landmarks": lambda: sensors_that_view(protocols.BLOCKS, protocols.PLACES),
     "a landmark in the plane": lambda: classes_of("landmark", "plane"),
     "a landmark in space": lambda: classes_of("landmark", "space"),
     "a motion": lambda: classes_of("motion"),
@@ -136,8 +137,8 @@ ROLES = {  # what a row of CONTRIBUTING is about, and where that is
 }
 
 
-def of_state(sensor: Any) -> bool:
-    return hasattr(sensor, "views")
+def sensors_that_view(*views: str) -> list[Any]:
+    return [one for one in classes_of("sensor") if getattr(one, "views", "") in views]
 
 
 def classes_of(role: str, world: str = "") -> list[Any]:

@@ -19,9 +19,10 @@ def counted(source: str) -> Counter[str]:
 
 def test_a_count_is_held_by_its_limit() -> None:
     assert against_limits(LIMITS, {"a": 3, "b": 998}) == []
-    above, unknown = against_limits(LIMITS, {"a": 4, "c": 0})
+    above, unknown = against_limits(LIMITS, {"a": 4, "b": 998, "c": 0})
     assert above.startswith("a: 4, at most 3: remove") and unknown.startswith("c: 0, at most None")
-    assert against_limits(LIMITS, {"b": 900})[0].endswith("lower the limit by --write")
+    assert against_limits(LIMITS, {"a": 3, "b": 900})[0].endswith("lower the limit by --write")
+    assert against_limits(LIMITS, {"a": 3})[0].startswith("b: 0, at most 1000: lower"), "a count of nothing is 0"
     assert lowered(LIMITS, {"a": 4, "b": 900}) == "| a | 3 | of old |\n| b | 900 | |\n"
 
 

@@ -17,7 +17,15 @@ WIDEST_PX, QUALITY = 400, 60  # of an image in a page; of several cameras as man
 
 
 class CameraImages:
-    """The images of a log by the cameras and the steps of a run's history."""
+    """The images of a log by the cameras and the steps of a run's history.
+
+    >>> eye = km.Mount(km.sensors.PinHole(), at=(0, 0, 0, 0, 0, 0, 1))
+    >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))
+    >>> run = km.record(slam, [km.Scan(0.0, "drone", "eye", [[320.0, 240.0]], ids=[1])], progress=False)
+    >>> log = km.Log("flight", ("drone",), [km.Frame(0.0, "drone", "eye", np.zeros((480, 640), np.uint8))])
+    >>> km.vision.CameraImages(log, run.history).at(run.history.cameras[0], step=0).shape
+    (480, 640)
+    """
 
     def __init__(self, log: Log, history: History) -> None:
         self.history = history
