@@ -13,7 +13,7 @@ from decimal import Decimal
 from itertools import groupby
 from numbers import Real
 from operator import attrgetter
-from typing import Any, ClassVar
+from typing import Any
 from unicodedata import category
 
 import numpy as np
@@ -259,13 +259,12 @@ class Control(_Timed):
     `u` has the motion model's shape and units; `cov` (same size, squared) overrides the model's own noise.
     `share` is less than 1 for a part of an increment, whose noise is that share of the whole one's, `cov` or the
     model's, and the variances `uneven` (k,) besides.  `largest` is the largest magnitude in `u`, `largest_cov` that
-    in `cov`.  `sensor` is "", as of all events without one.
+    in `cov`.
 
     >>> km.Control(t_s=0.5, robot="rover", u=(0.5, 0.02)).t_ns
     500000000
     """
 
-    sensor: ClassVar[str] = ""
     t_ns: int
     robot: str
     u: Array
@@ -374,7 +373,6 @@ class Fix(_Timed):
     array([1., 2.])
     """
 
-    sensor: ClassVar[str] = ""
     t_ns: int
     robot: str
     y: Array
@@ -513,7 +511,11 @@ def label_of_event(event: Event) -> str:
 
 def kind_of(event: Event) -> tuple[str, str, str]:
     """Return the kind of an event, its robot and its sensor ("" of what has none)."""
-    return type(event).__name__, event.robot, event.sensor
+    return type(event).__name__, event.robot, _sensor_of(event)
+
+
+def _sensor_of(event: Event) -> str:
+    return event.sensor if isinstance(event, Scan | Raw) else ""
 
 
 def sort_key(event: Event) -> tuple[int, int, str, str]:
@@ -526,7 +528,7 @@ def sort_key(event: Event) -> tuple[int, int, str, str]:
     >>> sort_key(km.Scan(0.1, "rover", "lidar", [[4.0, 0.3]]))
     (100000000, 1, 'rover', 'lidar')
     """
-    return event.t_ns, _RANK.get(type(event), 1), event.robot, event.sensor
+    return event.t_ns, _RANK.get(type(event), 1), event.robot, _sensor_of(event)
 
 
 def sort_events(events: list[Event]) -> list[Event]:

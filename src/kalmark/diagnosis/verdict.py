@@ -221,7 +221,7 @@ def _with_cure(
             tried = chain(tried, _of_less_certain_controls(*at, most, progress))
     if not taken or sum(one.gain for one in taken.values()) < least:
         return verdict
-    causes = [_cause(run, f, log) for f in taken.values()]
+    causes = [_cause(run, f, log) for f in sorted(taken.values(), key=lambda f: -f.gain)]
     left = [c for c in rest.causes if c.name not in [f.name for f in taken.values()]]
     worst = {c.name for c in verdict.causes[:1]}
     before = [c for c in left if c.name in worst and not c.harmless][:1]  # is not explained
