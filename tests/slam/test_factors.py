@@ -251,6 +251,29 @@ def test_a_reading_between_landmarks_or_robots_is_what_fuse_does() -> None:
     np.testing.assert_allclose(by_event.mean(1), by_call.mean(1), atol=1e-7)
 
 
+@pytest.mark.parametrize("sensor", ["tape", "lidar"])
+@pytest.mark.parametrize("names", [["door"], ["door", "mast", "rover"]])
+def test_an_observation_of_blocks_that_its_sensor_does_not_take_is_refused_and_changes_nothing(
+    sensor: str, names: list[str]
+) -> None:
+    tape = km.Mount(km.sensors.Distance())
+    rover = km.Robot(
+        "rover", km.motion.Unicycle(), sensors={"lidar": km.Mount(km.sensors.RangeBearing()), "tape": tape}
+    )
+    slam = km.Slam(rover)
+    slam.process(km.Scan(0.0, "rover", "lidar", [[4.0, 0.3], [2.0, -1.0]], ids=["door", "mast"]))
+    y = [[3.9], [3.9]] if sensor == "tape" else [[4.0, 0.3], [2.0, -1.0]]
+    before = slam.covariance("rover", "door", "mast")
+    with pytest.raises(EventError, match="expected"):
+        slam.process(km.Scan(0.1, "rover", sensor, y, of=[["door", "mast"], names]))
+    np.testing.assert_array_equal(slam.covariance("rover", "door", "mast"), before)
+    for name, mean in {"a": (1.0, 2.0), "b": (3.0, 2.0)}.items():
+        slam.add_landmark(name, mean)
+    report = slam.process(km.Scan(0.1, "rover", "tape", [[2.0], [3.9]], of=[["a", "b"], ["door", "mast"]]))
+    assert [one.outcome for one in report.observations] == ["ignored", "associated"]
+    assert "known exactly" in report.observations[0].reason
+
+
 def test_a_distance_to_a_landmark_of_unknown_depth_is_one_to_its_place() -> None:
     eye = km.Mount(km.sensors.Bearing(0.01))
     rover = km.Robot("r", km.motion.Odometry2D(), sensors={"eye": eye, "tape": km.Mount(km.sensors.Distance(0.01))})

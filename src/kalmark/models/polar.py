@@ -241,6 +241,8 @@ class RangeBearing(InPlane, _Placing):
 
 @declared
 class _InThree(_Placing):
+    """Range, azimuth and elevation, of points in space or at heights above the plane."""
+
     sigma_azimuth_rad: AzimuthNoise = 0.02
     sigma_elevation_rad: ElevationNoise = 0.02
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ from kalmark.tracks.scan import Start
 from kalmark.tracks.track import Tracks
 
 ROUNDS, SETTLED = 20, 1e-3  # linearisations at most, until nothing moves by that many of its sigmas
+EXACT = "all of these are known exactly"
 STEP = 1e-6  # of central differences, in m and rad
 
 
@@ -198,10 +200,9 @@ def correct_by_factor(state: State, factor: BlockMeasurement, share: float) -> t
     if not is_number(share) or not 0.0 < share <= 1.0:
         raise EventError(f"{factor.what}: gate is {short_text(share)}, expected a probability above 0, 1 for no gate")
     names, robots = factor.names, [str(name) for name in factor.names if name in state.robots]
-    blocks = _blocks(state.map, state.tracks, names)
-    if not any(block.dof for block in blocks):
-        raise EventError(f"{factor.what}: all of these are known exactly, expected one that is estimated")
-    factor.linearize(blocks, [block.mean for block in blocks])  # what is wrong with it shows before anything moves
+    if {*names} <= {*state.tracks.known}:
+        raise EventError(f"{factor.what}: {EXACT}, expected one that is estimated")
+    blocks = _checked_blocks(state, factor)
     if robots and state.t_ns is not None:
         moves.advance(state, *robots)  # a gap that is found here goes on: the robot's next report has it
         blocks = _blocks(state.map, state.tracks, names)
@@ -220,25 +221,53 @@ def correct_by_factor(state: State, factor: BlockMeasurement, share: float) -> t
 def correct_by_blocks(state: State, event: Scan, sensor: Any) -> Report:
     """Correct by what a sensor of blocks measures, one observation after the other; without names, of its robot.
 
-    An observation of what is not in the map is ignored.
+    An observation of what is not in the map, or only of what is known exactly, is ignored.  Raises EventError for one
+    that the sensor cannot make, and changes nothing.
     """
     R, report = measurements(event, sensor, getattr(sensor, "check", None)), Report(event, event.y)
+    what, found = f"{label_of_event(event)} by {event.sensor!r}", list[Observation]()
+    angular, places = np.array(sensor.angular, dtype=np.bool_), sensor.views == PLACES
+    of = event.of or ((event.robot,),) * len(event.y)
+    factors = [
+        BlockMeasurement(names, sensor.expect, event.y[k], R[k], angular, what, places) for k, names in enumerate(of)
+    ]
+    reasons = [_reason_to_ignore(state, names) for names in of]
+    for factor, reason in zip(factors, reasons, strict=True):
+        if not reason:
+            _checked_blocks(state, factor)
     state.t_ns = event.t_ns
     report.gaps = moves.advance(state, event.robot)
     report.blank(len(sensor.columns))
-    what, found = f"{label_of_event(event)} by {event.sensor!r}", list[Observation]()
-    angular, places = np.array(sensor.angular, dtype=np.bool_), sensor.views == PLACES
-    for k, names in enumerate(event.of or ((event.robot,),) * len(event.y)):
-        missing = [name for name in names if not state.is_there(name)]
-        if missing:
-            found.append(Observation(k, None, "ignored", event.robot, None, f"{missing[0]!r} is not in the map"))
+    for k, (factor, reason) in enumerate(zip(factors, reasons, strict=True)):
+        if reason:
+            found.append(Observation(k, None, "ignored", event.robot, None, reason))
             continue
-        factor = BlockMeasurement(names, sensor.expect, event.y[k], R[k], angular, what, places)
         seen, done = correct_by_factor(state, factor, sensor.pass_share)
         report.fill([k], done)
         found.append(seen._replace(index=k, landmark=event.robot))
     report.observations = found
     return report
+
+
+def _reason_to_ignore(state: State, names: Sequence[Id]) -> str:
+    """Return why nothing can be corrected by an observation of these blocks, "" if something can."""
+    missing = [name for name in names if not state.is_there(name)]
+    return f"{missing[0]!r} is not in the map" if missing else EXACT if {*names} <= {*state.tracks.known} else ""
+
+
+def _checked_blocks(state: State, factor: BlockMeasurement) -> list[MeasuredBlock]:
+    """Return the blocks of a factor.  Raises EventError for what is wrong with it, before anything moves."""
+    blocks = _blocks(state.map, state.tracks, factor.names)
+    try:
+        takes = signature(factor.expect)
+        takes.bind(*factor.names)
+    except TypeError:
+        wanted = f"one for each of {', '.join(takes.parameters)}"
+        raise EventError(f"{factor.what}: blocks {list_names(factor.names)}, expected {wanted}") from None
+    except ValueError:  # a function in C may have no signature
+        pass
+    factor.linearize(blocks, [block.mean for block in blocks])
+    return blocks
 
 
 def _blocks(map_: Map, tracks: Tracks, names: Sequence[Id]) -> list[MeasuredBlock]:

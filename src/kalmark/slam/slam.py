@@ -205,10 +205,12 @@ class Slam(Estimate):
     def _scan(self, event: Scan) -> Report:
         state = self.state
         key = event.robot, event.sensor
-        if key in state.readers:
-            return state_corrections.correct_by_reading(state, event, state.readers[key])
         if key in state.of_blocks:
             return correct_by_blocks(state, event, state.of_blocks[key])
+        if event.of is not None:
+            raise EventError(f"{label_of_event(event)}: of has names of blocks, expected those of a sensor of blocks")
+        if key in state.readers:
+            return state_corrections.correct_by_reading(state, event, state.readers[key])
         policy = self._policy(event)
         return self._found(event if policy.detector is None else policy.detector(event))
 
