@@ -82,8 +82,8 @@ class Kind:
 def kind_of(hint: Any) -> Kind:
     """Return how values of a hint are written and read."""
     origin, args = get_origin(hint), get_args(hint)
-    if hint == Id:
-        return _Scalar((int, str), "an id that is an integer or a text")
+    if hint in SIMPLE:
+        return SIMPLE[hint]
     if origin in (Union, UnionType):
         (of,) = (Id,) if {*args} == {int, str, NoneType} else (each for each in args if each is not NoneType)
         return _Optional(kind_of(of))
@@ -97,10 +97,6 @@ def kind_of(hint: Any) -> Kind:
         return _Tuple(tuple, tuple(map(kind_of, args)))
     if origin is Literal:
         return _Scalar((str,), f"one of {', '.join(args)}", args)
-    if hint in SIMPLE:
-        return SIMPLE[hint]
-    if hint is np.random.Generator:
-        return _Random()
     if issubclass(hint, Enum):
         return _Member(hint)
     if issubclass(hint, tuple):
@@ -127,14 +123,6 @@ class _Scalar(Kind):
         return value
 
 
-SIMPLE: dict[type, Kind] = {
-    bool: _Scalar((bool,), "true or false"),
-    int: _Scalar((int,), "an integer"),
-    float: _Scalar((float, int), "a number"),
-    str: _Scalar((str,), "a text"),
-}
-
-
 class _Random(Kind):
     """A generator of random numbers, by its state."""
 
@@ -144,6 +132,16 @@ class _Random(Kind):
     def read(self, reader: Reader, says: Any, now: Any) -> Any:
         now.bit_generator.state = says
         return now
+
+
+SIMPLE: dict[Any, Kind] = {
+    bool: _Scalar((bool,), "true or false"),
+    int: _Scalar((int,), "an integer"),
+    float: _Scalar((float, int), "a number"),
+    str: _Scalar((str,), "a text"),
+    Id: _Scalar((int, str), "an id that is an integer or a text"),
+    np.random.Generator: _Random(),
+}
 
 
 @dataclasses.dataclass(frozen=True)

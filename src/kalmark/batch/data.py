@@ -21,7 +21,7 @@ from kalmark.batch.batch_state import FIRST_MOUNT, LANDMARKS, POSE_SPACES, POSES
 from kalmark.batch.motion_chain import Chain, Starts
 from kalmark.batch.problem import Block, Factor, Problem, between, motionless, observation_factor, positions
 from kalmark.batch.wall_anchors import anchors
-from kalmark.events import Control, Event, Fix, Id, Raw, Scan, label_of_event, sort_events
+from kalmark.events import Control, Event, Fix, Id, Raw, Scan, kind_of, label_of_event, sort_events
 from kalmark.geometry.frames import compose
 from kalmark.geometry.spaces import mount_space
 from kalmark.models.landmarks import Point2D, Wall2D
@@ -158,9 +158,7 @@ def without_lags(given: BatchInput, events: Iterable[Event]) -> tuple[BatchInput
     if (np.diff(t_ns) < 0).any():
         raise unsolvable_problem("without their lags the scans have another order, expected the same")
     earlier = [
-        replace(event, t_ns=event.t_ns - lags[event.robot, event.sensor])
-        if isinstance(event, Scan | Raw) and (event.robot, event.sensor) in lags
-        else event
+        replace(event, t_ns=event.t_ns - lags[kind_of(event)[1:]]) if kind_of(event)[1:] in lags else event
         for event in events
     ]
     return replace(given, t_ns=t_ns), sort_events(earlier)

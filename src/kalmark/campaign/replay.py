@@ -41,6 +41,7 @@ from kalmark.simulate.robots import (
     Key,
     Simulation,
     add_diffusion,
+    draw_constants,
     draw_mount,
     draw_start,
     given_control,
@@ -277,16 +278,11 @@ class _Driven:
     drive: HeldInput
     given: Array = field(default_factory=lambda: np.zeros(0))
 
-    def advance(self, t_ns: int, rng: Generator, last: bool = False) -> None:
-        """Move by the control in force."""
-        part = self.drive.advance(t_ns, last)
-        if part is not None:
-            self.move(part, rng)
-
-    def move(self, part: MotionPart, rng: Generator) -> None:
-        """Move by a part of a control, with the diffusion of the control that the filter has."""
-        self.state, *_ = self.motion.move(self.state, part.u, part.dt_s)
-        self.state = add_diffusion(self.motion, self.state, self.given, part.dt_s, rng)
+    def move(self, rng: Generator, *parts: MotionPart | None) -> None:
+        """Move by parts of a control, with the diffusion of the control that the filter has."""
+        for part in filter(None, parts):
+            self.state, *_ = self.motion.move(self.state, part.u, part.dt_s)
+            self.state = add_diffusion(self.motion, self.state, self.given, part.dt_s, rng)
 
 
 class _Replaying:
@@ -298,8 +294,7 @@ class _Replaying:
         for name in replay.robots:
             robot = build_robot(replay.settings, name)
             motion, start = robot.motion, draw_start(robot, chance.route)
-            model = self_calibrating(motion)
-            constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.route)
+            constants = draw_constants(motion, chance.route)
             sensors = {key: draw_mount(mount, chance.mounts) for key, mount in robot.sensors.items()}
             self.robots[name] = _Driven(motion, start, constants, sensors, HeldInput(motion))
         self.events: list[Event] = []
@@ -317,7 +312,7 @@ class _Replaying:
                 after[event.event.t_ns] = {name: robot.state for name, robot in self.robots.items()}
             else:
                 robot = self.robots[event.robot]
-                robot.advance(event.t_ns, self.chance.control)
+                robot.move(self.chance.control, robot.drive.advance(event.t_ns))
                 y = robot.state[:2] + gaussian(event.cov, self.chance.sight)
                 self.events.append(Fix(t_ns=event.t_ns, robot=event.robot, y=y, cov=event.cov))
         times = np.array([*after], dtype=np.int64)
@@ -331,19 +326,19 @@ class _Replaying:
     def _steer(self, steer: Steer) -> None:
         """Take the control that leads back to the path, and give it to the filter with noise."""
         event, robot, rng = steer.event, self.robots[steer.event.robot], self.chance.control
-        robot.advance(event.t_ns, rng, last=True)
+        robot.move(rng, robot.drive.advance(event.t_ns, last=True))
         N = control_covariance(robot.motion, event)
         u = steer_to_path(robot.motion, robot.state, steer, N)
         robot.given = given_control(robot.motion, u, robot.constants, steer.dt_s) + gaussian(N, rng)
         self.events.append(replace(event, u=robot.given))
-        for part in robot.drive.accept(replace(event, u=u, cov=None)):
-            robot.move(part, rng)
+        robot.move(rng, *robot.drive.accept(replace(event, u=u, cov=None)))
 
     def _look(self, look: ReplayedScan) -> None:
         """Look at the same landmarks; what cannot be seen from where the robot truly is is left out."""
         event, robot = look.event, self.robots[look.event.robot]
         for name in (event.robot, *(name for name in look.real if name in self.robots)):
-            self.robots[str(name)].advance(event.t_ns, self.chance.control)
+            other = self.robots[str(name)]
+            other.move(self.chance.control, other.drive.advance(event.t_ns))
         places = {name: other.state[:2] for name, other in self.robots.items()} | self.replay.recorded.landmarks
         sensor, at = robot.sensors[event.sensor]
         v = things_in_frame(POINTS, sensor_pose(robot.state, at)[0], np.array([places[name] for name in look.real]))

@@ -18,7 +18,7 @@ from kalmark.config.true_start import true_start
 from kalmark.declare import built_in, registered_name
 from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import LogError, MapError, ModelError
-from kalmark.events import Control, Raw, Scan
+from kalmark.events import Raw
 from kalmark.geometry.named_poses import world_of
 from kalmark.logs.formats import known_formats
 from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
@@ -190,7 +190,7 @@ def _start_at_rest(motion: Inertial, name: str, log: Log | None, start: Any, cov
 
     Raises ModelError.
     """
-    readings = [event for event in log or () if isinstance(event, Control) and event.robot == name]
+    readings = [] if log is None else log.controls_of(name)
     if not readings:
         raise ModelError(
             f"{name} has no readings of its inertial unit yet, expected a log that begins at rest. Events one by one "
@@ -242,7 +242,7 @@ def refuse_scans(config: Config, key: str, name: str, mounts: Mapping[str, Mount
             kind = "its beams" if raw else f"its type {config.robots[key].sensors[sensor].type}"
             fitting, wanted = [] if raw else _fitting("sensor", given), f"{', '.join(columns)} of {kind}"
             raise _other_columns(log, name, sensor, given, wanted, fitting, f"{key}.sensors.{sensor}", columns)
-    used = {event.sensor: None for event in log.events if isinstance(event, Scan | Raw) and event.robot == name}
+    used = [sensor for robot, sensor in log.sensors() if robot == name]
     other = next((sensor for sensor in used if sensor not in mounts), None)
     if other is None or config.log.on_error == "skip":
         return

@@ -11,7 +11,6 @@ from kalmark.config.reading import ENDINGS, config_of, one_near, resolve_config,
 from kalmark.config.schema import TRUTH, Config, LogConfig
 from kalmark.config.tree import EACH, OVERRIDE, KeyPath, Plain, Tree, merge_trees, read_tree, tree_of, with_each
 from kalmark.errors import ConfigError, LogError
-from kalmark.events import Raw, Scan
 from kalmark.logs import find_data, known_formats, open_log
 from kalmark.logs.formats import recognise
 from kalmark.logs.log import Log
@@ -213,8 +212,7 @@ def resolve_each(tree: Tree, log: Log) -> None:
     """Let ``sensors.each`` stand for the log's sensors; leave ``robots.each`` out where all robots have entries."""
     for node, path in with_each(tree.values):
         if path[-1] == "sensors":
-            scans = (e for e in log.events if isinstance(e, Scan | Raw) and path[1] in (e.robot, EACH))
-            for sensor in sorted({scan.sensor for scan in scans} - node.keys()):
+            for sensor in sorted({sensor for robot, sensor in log.sensors() if path[1] in (robot, EACH)} - node.keys()):
                 tree.share(node, path, sensor)
         if path[-1] == "sensors" or all(name in node for name in log.robots):
             del node[EACH]

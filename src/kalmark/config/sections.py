@@ -230,14 +230,11 @@ def _field(parameter: Parameter, others: list[Parameter], models: tuple[type, ..
     """Return a parameter as a field; where the plane and space have different defaults, it has none."""
     default, text = parameter.default, parameter.text
     if any(other.default != default for other in others):
-        worlds = [f"{own.default:g} in {_in(model)}" for own, model in zip([parameter, *others], models, strict=True)]
+        places = ["the plane" if world_of_class(model) == "plane" else "space" for model in models]
+        worlds = [f"{own.default:g} in {place}" for own, place in zip([parameter, *others], places, strict=True)]
         default, text = None, f"{text[:-1]}; if absent {', '.join(worlds)}."
         parameter = replace(parameter, optional=True)
     return annotation(parameter), Field(default=default, description=text or None)
-
-
-def _in(model: type) -> str:
-    return "the plane" if world_of_class(model) == "plane" else "space"
 
 
 def options_section(

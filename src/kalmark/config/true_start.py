@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.events import Control
 from kalmark.geometry.pose_frames import FRAMES
 from kalmark.logs.log import Log, begins_at
 from kalmark.models.protocols import Motion, coasts
@@ -56,7 +55,7 @@ def pieces(
 
     A held control ends there; increments end at the first of their ends from there on.
     """
-    controls = [event for event in log.events if isinstance(event, Control) and event.robot == name]
+    controls = log.controls_of(name)
     last_ns = begin_ns
     for k, control in enumerate(controls):
         N = motion.control_noise(control.u) if control.cov is None else control.cov

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from kalmark.arrays import Array
 from kalmark.datasets.array_files import arrays
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan, short_text
@@ -47,17 +46,15 @@ def read(path: Path, request: Request) -> Log:
     """Return the log: an increment ends at its time, its turn is half before and half after its way."""
     name = path.name.removesuffix(ODOMETRY)
     steps = timed_rows(path, ("distance_m", "dtheta_rad"), request.refuse)
-    events: list[Event] = [Control(t_ns=t_ns, robot=ROBOT, u=increment_at_middle(*u)) for _, t_ns, u in steps]
+    events: list[Event] = [
+        Control(t_ns=t_ns, robot=ROBOT, u=[along * np.cos(turn / 2), along * np.sin(turn / 2), turn])
+        for _, t_ns, (along, turn) in steps
+    ]
     events += range_scans(path.with_name(name + RANGES), request)
     truth, beacons = read_truth(path.with_name(name + TRUTH))
     columns, sensors = INCREMENT2, {SENSOR: ("range_m",)}
     return one_robot("plaza", path.parent, request, ROBOT, events, columns, sensors,
                      name=name.lower(), truth=truth, landmarks=beacons)  # fmt: skip
-
-
-def increment_at_middle(distance: float, turn: float) -> Array:
-    """Return (dx, dy, dtheta) in the frame of the pose before."""
-    return np.array([distance * np.cos(turn / 2), distance * np.sin(turn / 2), turn])
 
 
 def range_scans(path: Path, request: Request) -> Iterator[Scan]:

@@ -39,7 +39,7 @@ def cut_increments(log: Log) -> Log:
         for robot in (event.robot, *seen):
             asked[str(robot)].add(event.t_ns)
     for robot in log.robots:
-        controls = [event for event in log.events if isinstance(event, Control) and event.robot == robot]
+        controls = log.controls_of(robot)
         columns = tuple(log.control_columns.get(robot, ()))
         events += _parts(controls, columns, sorted(asked[robot])) if columns in CUT else controls
     return replace(log, events=sorted(events, key=sort_key))

@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Id, Scan, list_names
+from kalmark.events import Control, Event, Id, Raw, Scan, list_names
 from kalmark.geometry.angles import wrap
 
 Times = Index
@@ -164,6 +164,8 @@ class Log:
     >>> log = km.log_from(controls=controls)
     >>> len(log), log.control_columns, log.truth
     (2, {'rover': ('v_mps', 'w_radps')}, {})
+    >>> [control.u.tolist() for control in log.controls_of("rover")], log.sensors()
+    ([[0.5, 0.0], [0.5, 0.1]], [])
     """
 
     name: str
@@ -194,6 +196,14 @@ class Log:
 
     def __len__(self) -> int:
         return len(self.events)
+
+    def controls_of(self, robot: str) -> list[Control]:
+        """Return the controls of a robot, in their order."""
+        return [event for event in self.events if isinstance(event, Control) and event.robot == robot]
+
+    def sensors(self) -> list[SensorKey]:
+        """Return the robot and the sensor of every scan or raw data, each once, in the order of the first."""
+        return [*dict.fromkeys((event.robot, event.sensor) for event in self.events if isinstance(event, Scan | Raw))]
 
     def other_columns(self, robot: str, sensor: str, given: Iterable[str], wanted: str) -> LogError:
         """Return the error of other columns than are `wanted` of a robot's controls (sensor ""), or of its scans."""

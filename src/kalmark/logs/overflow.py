@@ -6,7 +6,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import LogError
-from kalmark.events import Control, fixed_seconds
+from kalmark.events import fixed_seconds
 from kalmark.logs.log import Log
 from kalmark.logs.table_columns import WHEELS
 
@@ -19,7 +19,7 @@ OFF = 0.2  # of a step: increments are whole numbers of steps up to this
 def refuse_overflow(log: Log) -> None:
     """Refuse increments of wheels across an overflow of their counter.  Raises LogError with the number to add."""
     for robot, columns in log.control_columns.items():
-        controls = [event for event in log.events if isinstance(event, Control) and event.robot == robot]
+        controls = log.controls_of(robot)
         if columns != WHEELS or not controls:
             continue
         for name, values in zip(columns, np.array([control.u for control in controls]).T, strict=True):

@@ -194,7 +194,9 @@ def optional(name: str, default: T) -> Callable[[object], T]:
     return read
 
 
-OPTIONAL = {"cov_size", "keep", "parameter_names"}
+OPTIONAL = {"cov_size", "parameter_names"}
+keep = optional("keep", 1)
+"""Of how many of its last scans a sensor of a change keeps the poses."""
 finds_depth = optional("finds_depth", True)
 """True where one measurement determines the distance of the landmark."""
 has_second_camera = optional("of_pair", False)
@@ -456,7 +458,7 @@ def with_jacobians(expected: Any) -> tuple[Any, ...]:
 
 def poses_kept(sensor: OfState) -> int:
     """Return of how many of its last scans a sensor of a change keeps the poses; by default of the last one."""
-    return getattr(sensor, "keep", 1) if sensor.views == CHANGE else 1
+    return keep(sensor) if sensor.views == CHANGE else 1
 
 
 @runtime_checkable

@@ -213,8 +213,7 @@ class MapLandmarks:
                 means[k], covariances[k] = mean, covariance
         observations = [int(count) for count in table.observations]
         exact = frozenset(name for name in table.ids if slam.is_known(name))
-        likely = {name: slam.classes(name) for name in table.ids}
-        classes = {name: max(of.items(), key=itemgetter(1)) for name, of in likely.items() if of}
+        classes = {name: max(own.items(), key=itemgetter(1)) for name in table.ids if (own := slam.classes(name))}
         of = means, covariances, observations, in_space, exact, table.log_odds, table.unseen, classes
         return cls(list(table.ids), list(table.kinds), *of)
 

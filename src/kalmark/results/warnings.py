@@ -18,13 +18,13 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from difflib import get_close_matches
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags
+from kalmark.config.reading import did_you_mean
 from kalmark.declare import class_of, registered_name
 from kalmark.geometry.gaussian import gate, quantile
 from kalmark.logs.log import Section
@@ -384,8 +384,7 @@ def _sensors(run: Recording, summary: Summary) -> Iterator[str]:
         configured: Section = (given or {}).get("sensors") or {}
         for name, section in configured.items() if mine else ():
             if name not in used and (section or {}).get("type") != NOTICES:
-                near = get_close_matches(name, used, n=1, cutoff=0.5)
-                hint = f"; did you mean {near[0]}?" if near else ""
+                hint = did_you_mean(name, used)
                 yield f"no observation is by the sensor {name} of {', '.join(mine)}, which is configured{hint}"
 
 

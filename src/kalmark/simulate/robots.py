@@ -242,8 +242,7 @@ def sim_robot(world: World, robot: Robot, area: Array, chance: Chance, scenery: 
         lag_s = mount.lag_s + (chance.mounts.normal(0.0, mount.sigma_lag_s) if mount.sigma_lag_s else 0.0)
         sensors[key] = SimSensor(true, at, sensing, laser, raw, mount.classes, max(lag_s + sensing.late_s, 0.0))
     course = simulated.route.course(world.steps, world.dt_s, area, chance.route)
-    model = self_calibrating(motion)
-    constants = np.zeros(0) if model is None else gaussian(model.calibration_cov, chance.mounts)
+    constants = draw_constants(motion, chance.mounts)
     given, done = np.empty((2, world.steps, len(motion.columns)))
     poses = states[:, : 3 if world.dimensions == 2 else 7]
     return SimRobot(robot.name, motion, sensors, states, poses, given, done, course, next(course[1]), constants)
@@ -269,6 +268,12 @@ def draw_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
         return sensor.with_parameters(sensor.parameters + gaussian(cov, rng)), at
     scale, bias_m = rng.normal([sensor.scale, sensor.bias_m], [sensor.sigma_scale, sensor.sigma_bias_m]).tolist()
     return replace(sensor, scale=scale, bias_m=bias_m, sigma_scale=0.0, sigma_bias_m=0.0), at
+
+
+def draw_constants(motion: Any, rng: Generator) -> Array:
+    """Return the true constants (c,) by which all controls are wrong; none of a motion that has none."""
+    model = self_calibrating(motion)
+    return np.zeros(0) if model is None else gaussian(model.calibration_cov, rng)
 
 
 def given_control(motion: Any, u: Array, constants: Array, dt_s: float) -> Array:

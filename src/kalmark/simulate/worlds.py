@@ -29,7 +29,7 @@ from kalmark.config.sections import Section, model_of, unexpected_value
 from kalmark.config.tree import Tree, merge_trees, read_tree
 from kalmark.declare import Count, Positive
 from kalmark.models.landmarks import PointHeight2D
-from kalmark.models.protocols import sees_kinds
+from kalmark.models.protocols import keep, sees_kinds
 from kalmark.plugins import entry_points_of
 from kalmark.simulate.layouts import Layout
 from kalmark.simulate.routes import Constant, Route, Waypoints
@@ -55,7 +55,7 @@ class _Underway(Section):
         for name in self.sensing:
             if name not in robot.sensors:
                 raise unexpected_value(f"sensing of {' or '.join(robot.sensors) or 'no sensor'}, not of {name!r}")
-            if self.sensing[name].loop_reach_m is not None and getattr(robot.sensors[name], "keep", 1) == 1:
+            if self.sensing[name].loop_reach_m is not None and keep(robot.sensors[name]) == 1:
                 raise unexpected_value(f"loop_reach_m of an odometer whose keep is 0, or 2 or more, not of {name!r}")
         return self
 

@@ -365,21 +365,21 @@ def default_landmark(sensor: Sensor, at: Array, calibrated: bool, delayed: bool)
     """
     if "size_m" in sensor.columns or "qw" in sensor.columns:
         return Tag()
+    measured = sees_kinds(sensor) or ()
     if len(at) == 3:
-        alone: dict[tuple[str, ...], Any] = {(Wall2D.kind,): Wall2D, (PointHeight2D.kind,): PointHeight2D}
-        if (only := alone.get(sees_kinds(sensor) or ())) is not None:
-            made: Landmark = only()
-            return made
+        alone: dict[tuple[str, ...], Landmark] = {(kind.kind,): kind() for kind in (Wall2D, PointHeight2D)}
+        if measured in alone:
+            return alone[measured]
         if not finds_depth(sensor) and not delayed:
             return InverseDepth2D()
         if "signature" in sensor.columns:
             return PointSignature2D()
         return Polar2D() if _arcs_matter(sensor) else Point2D()
-    if "point3" not in (sees_kinds(sensor) or ("point3",)):
+    if measured and "point3" not in measured:
         return kinds.AnchoredHomogeneousLine()
     anchored = kinds.AnchoredHomogeneous()
     if finds_depth(sensor):
-        return anchored if calibrated and anchored.kind in (sees_kinds(sensor) or ()) else Point3D()
+        return anchored if calibrated and anchored.kind in measured else Point3D()
     return anchored if calibrated else kinds.Homogeneous()
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.errors import RunError
-from kalmark.events import Control, Event, Fix, Frame, Raw, Scan
+from kalmark.events import Control, Event, Fix, Frame, kind_of
 from kalmark.logs.log import Log, poses_of_size
 from kalmark.logs.progress import track
 from kalmark.picture_options import Picture
@@ -51,7 +51,7 @@ def follow(slam: Slam, log: Log, picture: Picture, save: Path | None = None) -> 
     scene = replace(scene, picture=picture)
     size = 3 if scene.d == 2 else 7
     stream, to_map = Stream(log.name, scene, save), truth_to_map(slam, log, size)
-    scans = any(isinstance(event, Scan | Raw) for event in log.events)
+    scans = bool(log.sensors())
     steps, begin_ns, last_s = 0, 0, -np.inf
 
     def truth(name: str, t_ns: int) -> Array:
@@ -83,7 +83,7 @@ def follow(slam: Slam, log: Log, picture: Picture, save: Path | None = None) -> 
         models = [None if o.landmark is None else slam.landmark_model(o.landmark) for o in report.observations]
         kinds = ["" if model is None else model.kind for model in models]
         for camera in now.cameras:
-            if isinstance(event, Scan | Raw) and (camera.robot, camera.sensor) == (event.robot, event.sensor):
+            if kind_of(event)[1:] == (camera.robot, camera.sensor):
                 for image in images_of_report(camera, report, kinds):
                     frame = event if isinstance(event, Frame) else None
                     grey = None if frame is None else frame.right_grey() if image.side == "right" else frame.grey()
