@@ -443,6 +443,17 @@ def gaps() -> Iterator[Figure]:
     for world, ids in itertools.product(worlds, ("ids", "no ids")):
         yield Figure(section, f"carried away, `{world}`, {ids}: found / after, at most / false alarms / maps with something twice",
                      "95 % / 30 s / 0 / 0", command, row(f"{world} {ids}", "{1} of {3} / {9} s / {13} / {18}"))  # fmt: skip
+    command = "python benchmarks/anywhere.py"
+    for way, said in (
+        ("start", "a start anywhere in a known map"),
+        ("known", "carried away in a known map"),
+        ("own", "in its own map"),
+    ):
+        for case, within in (("points", 30), ("points_no_ids", 30), ("rays", 30), ("four_ranges", 30), ("points_of_space", 2),
+                             ("rays_of_space", 2), ("ranges_of_space", 2), ("corners_of_tags", 2), ("poses_of_tags", 2)):  # fmt: skip
+            if way != "own" or case in ("points", "points_of_space", "corners_of_tags", "poses_of_tags"):
+                yield Figure(section, f"{said}, {case.replace('_', ' ')}: placed / after, median, most / sure of another place",
+                             f"95 % / {within} s / 0", command, row(f"{way} {case}", "{0} of {2} / {4} s, {8} s / {12}"))  # fmt: skip
     section, command = "Walls", "python benchmarks/walls.py"
     for name, wanted in (("invariant", ("3 / 90 %", "0 / 0")), ("ekf", ("", ""))):
         yield Figure(section, f"hall of walls and corners, raw laser, no ids, 50 runs, `{name}`: pose ANEES / steps in its band",

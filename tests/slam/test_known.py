@@ -187,6 +187,25 @@ def test_a_start_anywhere_is_found(ids: bool, motion: Any) -> None:
     assert np.sqrt(np.diag(P)).max() < 0.2
 
 
+def test_a_start_anywhere_is_found_by_bearings_with_ids() -> None:
+    mount = km.Mount(km.sensors.Bearing(0.01), at=AT)
+    cov = np.diag([10.0, 10.0, 3.0]) ** 2
+    slam = km.Slam(km.Robot("rover", km.motion.Unicycle(), start=(0, 0, 0), cov=cov, sensors={"camera": mount}))
+    for i, post in enumerate(POSTS):
+        slam.add_landmark(i, post)
+    rng, pose = np.random.default_rng(2), np.array([3.0, -2.0, 2.8])
+    y = km.geometry.observe(compose(pose, AT)[0], POSTS)[0]
+    near = np.flatnonzero(y[:, 0] < 6.0)
+    y = y[near, 1:] + 0.01 * rng.normal(size=(len(near), 1))
+    two = slam.process(km.Scan(t_s=0.1, robot="rover", sensor="camera", y=y[:2], ids=near[:2].tolist()))
+    assert {o.outcome for o in two.observations} == {"deferred"}
+    report = slam.process(km.Scan(t_s=0.2, robot="rover", sensor="camera", y=y, ids=near.tolist()))
+    assert {o.outcome for o in report.observations} == {"associated"}
+    off, P = slam.mean("rover") - pose, slam.covariance("rover")
+    assert off @ np.linalg.solve(P, off) < 16
+    assert np.sqrt(np.diag(P)).max() < 0.2
+
+
 def test_a_start_that_a_scan_does_not_determine_waits() -> None:
     slam = anywhere(association=km.association.Automatic())
     report = slam.process(km.Scan(t_s=0.1, robot="rover", sensor="laser", y=[[3.0, 0.1], [2.0, 1.0]]))

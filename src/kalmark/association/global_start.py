@@ -82,8 +82,12 @@ def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -
 
 
 def locate_rays(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:
-    """Return the pose that unit vectors v (K, d) with these ids and sigmas (K,), rad, determine, or why they do not."""
-    return _by_ids(of, rows_of(of, ids), FEWEST_RAYS[v.shape[1]], _Rays(v, sigma))
+    """Return the pose that unit vectors v (K, d) with these ids determine, or why they do not.
+
+    Each sigma (K,) is the root of the mean variance of d axes, of which one, that of the ray, has none.
+    """
+    d = v.shape[1]
+    return _by_ids(of, rows_of(of, ids), FEWEST_RAYS[d], _Rays(v, sigma * math.sqrt(d / (d - 1))))
 
 
 class _Points(NamedTuple):

@@ -201,8 +201,7 @@ def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Propos
         v, V = scan.channel.calibrated(scan.map).invert(scan.y)
         found = locate_tags(old, scan.ids, v, V @ scan.R @ V.swapaxes(1, 2))
     elif scan.channel.gives_rays:
-        v, sigma = scan.places()
-        found = locate_rays(old, scan.ids, v, sigma * math.sqrt(scan.dimensions / (scan.dimensions - 1)))
+        found = locate_rays(old, scan.ids, *scan.places())
     else:
         found = locate_points(old, *_constellation(state, scan, of))
     return None if isinstance(found, str) else found

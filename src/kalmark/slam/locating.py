@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.association.global_start import FEWEST, FEWEST_NAMED, locate_points, rows_of
+from kalmark.association.global_start import FEWEST, FEWEST_NAMED, locate_points, locate_rays, rows_of
 from kalmark.association.protocol import NEW, Decision
 from kalmark.association.query import Query
 from kalmark.events import Id
@@ -43,18 +43,21 @@ from kalmark.tracks.survey_checks import SURVEYED
 
 UNNAMED = "the pose of its robot is not known yet, and it has no id of a known landmark"
 ONE = "from an unknown place it takes two known landmarks, expected a second one or a start with a smaller sigma_xy_m"
-DIRECTION = "it determines no distance from an unknown place, expected ranges too or a start with a smaller sigma_xy_m"
+DIRECTION = (
+    "it determines no distance from an unknown place, expected three bearings of known landmarks in a scan, ranges too "
+    "or a start with a smaller sigma_xy_m"
+)
 
 
 class Located(NamedTuple):
-    """The pose T (3,) of the sensor, and what each observation is of; or, without them, why it is not known yet.
+    """The decisions of a scan whose robot was placed by it, or why its pose is not known yet.
 
     `fates` (K,) are those of observations that have corrected what is known of the pose, and do not determine it.
     """
 
-    T: Array | None
-    decisions: list[Decision] | None
     why: str
+    is_placed: bool = False
+    decisions: list[Decision] | None = None
     fates: Sequence[Observation] = ()
 
 
@@ -71,47 +74,47 @@ def locate_in_known_map(state: State, scan: ScanContext, query: Query) -> Locate
     if scan.channel.gives_places:
         if len(state.tracks.known) < FEWEST or (not shown and turn_holds(P)):
             return None
-        found = _locate(query)
-        if found.T is not None:
-            _put(state, scan, found.T)
-            state.sums.pop(name, None)
-        return found
+        return _locate(state, query)
     if not can_be_summed(scan.channel):
         return None
     if sum_ is None or not shown:
         is_turn, bent = turn_holds(P), _nonlinear_axes(state, scan)
         if bent is None:
-            return None if is_turn or len(state.tracks.known) < FEWEST else Located(None, None, UNNAMED)
+            return None if is_turn or len(state.tracks.known) < FEWEST else Located(UNNAMED)
         is_distance = distances_alone(scan.channel.sensor)
         if is_turn and not (bent[1:].any() and is_distance):
             return None
         if not is_turn and bent[1:].any() and not is_distance:
-            return Located(None, None, DIRECTION)
+            found = _locate(state, query) if scan.channel.gives_rays else None
+            return found if found and found.is_placed else Located(DIRECTION)
         if not is_turn and bent[1:].any() and len(state.tracks.known) + len(state.surveys.trial) < 2:
-            return Located(None, None, ONE)
+            return Located(ONE)
         moving = state.moving[name]
         sum_ = state.sums[name] = GaussianSum.of(state.map, moving, state.blocks, scan.event.t_ns, _gate(scan))
     return _summed(state, scan, sum_)
 
 
-def _locate(query: Query) -> Located:
-    """Return where the sensor of a scan is in the known map, if the scan determines it."""
+def _locate(state: State, query: Query) -> Located:
+    """Move a robot to where its sensor is in the known map, if its scan determines that."""
     scan, ids = query.scan, query.ids
+    find = locate_rays if scan.channel.gives_rays else locate_points
     of = next((known for kind, known in scan.tracks.known.of_kind.items() if kind in scan.channel.models), None)
     if of is None:
-        return Located(None, None, "its sensor does not find the places of known landmarks")
-    found = locate_points(of, ids, *scan.places())
+        return Located("its sensor does not find the places of known landmarks")
+    found = find(of, ids, *scan.places())
     if isinstance(found, str):
-        return Located(None, None, found)
+        return Located(found)
+    _put(state, scan, found.T)
+    state.sums.pop(scan.event.robot, None)
     if (rows_of(of, ids) >= 0).sum() >= FEWEST_NAMED[2]:
-        return Located(found.T, None, "")
+        return Located("", True)
     why = f"found in the known map: {(found.matched >= 0).sum()} of {ids.count(None)} observations agree"
     missed: Decision = NEW, "not of the known map from where the others are"
     decisions: list[Decision] = [
         (i, "") if i is not None else (of.names[row], why) if row >= 0 else missed
         for i, row in zip(ids, found.matched.tolist(), strict=True)
     ]
-    return Located(found.T, decisions, "")
+    return Located("", True, decisions)
 
 
 def _nonlinear_axes(state: State, scan: ScanContext) -> Flags | None:
@@ -228,7 +231,7 @@ def _summed(state: State, scan: ScanContext, sum_: GaussianSum) -> Located:
         sum_.linear = sum_.linear + 1 if holds else 0
     if sum_.linear >= IN_A_ROW:
         del state.sums[robot]
-    return Located(None, None, "", fates)
+    return Located("", fates=fates)
 
 
 def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:

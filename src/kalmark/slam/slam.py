@@ -329,7 +329,7 @@ class Slam(Estimate):
         state = self.state
         query = Query(scan)
         located = locating.locate_in_known_map(state, scan, query)
-        if located is not None and located.T is None:
+        if located is not None and not located.is_placed:
             if not located.fates:
                 scan.report.blank(scan.channel.dof)
             waits = [Observation(k, i, "deferred", None, None, located.why) for k, i in enumerate(scan.ids)]
