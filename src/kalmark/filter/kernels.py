@@ -51,7 +51,7 @@ _TRANS_NO = np.array([ord("T"), ord("N"), ord("T")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
 CACHED = 512  # rows of a covariance that stays in a cache between one pass over it and the next
-BAND, NARROW = 128, 32  # rows of a larger one that do, and rows of a smaller one that are corrected at once
+BAND, NARROW = 128, 16  # rows of a larger one that do, and rows of a smaller one that are corrected at once
 TILE = 64  # rows of a tile of which two do
 FEW = 8  # rows of a factor whose product takes less time without BLAS
 
@@ -333,14 +333,15 @@ def downdate_and_transport(P: Array, V: Array, a: Array, theta: Index) -> None:
                 w[c, j] -= v * V[i, j]
     add_half_turn(w, a_T, theta)
     L, R = np.empty((q + 2 * axes, n)), np.empty((q + 2 * axes, n))
-    for i in range(len(L)):
+    for i in range(q):
         for j in range(n):
-            if i < q:
-                L[i, j] = R[i, j] = V[i, j]
-            elif i < q + axes:
-                L[i, j], R[i, j] = -w[i - q, j], a_T[i - q, j]
-            else:
-                L[i, j], R[i, j] = -a_T[i - q - axes, j], w[i - q - axes, j]
+            L[i, j] = R[i, j] = V[i, j]
+    for c in range(axes):
+        for j in range(n):
+            L[q + c, j] = -w[c, j]
+            R[q + c, j] = a_T[c, j]
+            L[q + axes + c, j] = -a_T[c, j]
+            R[q + axes + c, j] = w[c, j]
     subtract_symmetric(P, L, R)
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from kalmark.arrays import Index
 from kalmark.filter.compressed import restoring as compressed
 from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.compressed.restoring import NUMBERS
@@ -43,7 +44,7 @@ class CostBalance:
     saved: float = 0.0
     pays: bool = False
 
-    def add_correction(self, slots: list[int], d: int, q: int, n: int) -> None:
+    def add_correction(self, slots: Index, d: int, q: int, n: int) -> None:
         """Count a correction of n rows by q numbers, in which blocks of d numbers are observed.
 
         The first that counts is one that may take longer in a dense map.
@@ -51,7 +52,7 @@ class CostBalance:
         if q * n**2 <= STEP and self.number == self.corrections == 0:
             return
         entries = 0
-        for slot in slots:
+        for slot in slots.tolist():
             last = self.observed.get(slot)
             if last != self.number:
                 self.observed[slot] = self.number

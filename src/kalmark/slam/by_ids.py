@@ -54,15 +54,15 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
             used = done.fused.tolist()
     report.e, report.z, report.Z = done[:3]
     judged = JudgedScan(range(len(ids)), ids, ids, done, gate)
+    report.judged = (judged,)
     tracks.count(ids, used)
+    if report.gaps and any(used):
+        moving.held.located(event.t_ns)
     if scan is not None:
         scan.add_reports(ids, judged.rows, used)
         if policy.contests:
             tentative.contest(state, scan, model, judged, elsewhere.misfits(state, scan, done), policy.upkeep.odds)
-    if report.gaps and any(used):
-        moving.held.located(event.t_ns)
-    report.judged = (judged,)
-    if scan is not None and state.evidence:
-        elsewhere.weigh(state, scan, None)
+        if state.evidence:
+            elsewhere.weigh(state, scan, None)
     state.let_grow()
     return report

@@ -15,12 +15,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.errors import EventError, MapError
+from kalmark.errors import MapError
 from kalmark.events import Control
 from kalmark.filter.estimators import Movement
 from kalmark.filter.kernels import moved_noise
@@ -97,8 +97,8 @@ def control_covariance(motion: Motion, control: Control) -> Array:
 class HeldInput:
     """The control in force of one robot and how far it has been acted upon.
 
-    As a context manager it puts the clock back if a control turns out to be impossible.  `gaps` watches for controls
-    that stop.  Controls up to `rests_until_ns` are those of a robot that stands: its start was found from them.
+    `put_back` undoes what a control that turns out to be impossible has changed.  `gaps` watches for controls that
+    stop.  Controls up to `rests_until_ns` are those of a robot that stands: its start was found from them.
     """
 
     t_ns: int | None
@@ -114,7 +114,6 @@ class HeldInput:
         self.t_ns = self.u = self.N = self.usual = self.mean = None
         self.fresh, self.gaps = True, None if self.coasts else gaps
         self.rests_until_ns = -math.inf if rests_until_ns is None else rests_until_ns
-        self._before: tuple[dict[str, Any], dict[str, Any]] = {}, {}
 
     def restored(self) -> None:
         """Check the arrays of a file.  Raises MapError."""
@@ -124,16 +123,16 @@ class HeldInput:
             if array is not None and array.shape != shape:
                 raise MapError(f"a control has an array {array.shape}, expected {shape}")
 
-    def __enter__(self) -> Self:
-        self._before = {**vars(self)}, {} if self.gaps is None else {**vars(self.gaps)}
-        return self
+    def snapshot(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return what it is now, for `put_back`: its own attributes, and those of its `gaps`."""
+        return {**vars(self)}, {} if self.gaps is None else {**vars(self.gaps)}
 
-    def __exit__(self, kind: Any, *_: object) -> None:
-        (own, watched), self._before = self._before, ({}, {})
-        if kind is not None and issubclass(kind, EventError):
-            vars(self).update(own)
-            if self.gaps is not None:
-                vars(self.gaps).update(watched)
+    def put_back(self, before: tuple[dict[str, Any], dict[str, Any]]) -> None:
+        """Make it what it was at a `snapshot`."""
+        own, watched = before
+        vars(self).update(own)
+        if self.gaps is not None:
+            vars(self.gaps).update(watched)
 
     @property
     def in_force(self) -> Array:

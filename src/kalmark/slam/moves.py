@@ -26,7 +26,9 @@ def advance(state: State, name: str, *others: str, before: Moves = ()) -> tuple[
     assert state.t_ns is not None
     if not others and not before and state.moving[name].held.stays(state.t_ns):
         return ()
-    with state.moving[name].held as held:
+    held = state.moving[name].held
+    clock = held.snapshot()
+    try:
         part = held.advance(state.t_ns)
         moves = before if part is None else (*before, (name, part))
         if others:
@@ -36,7 +38,10 @@ def advance(state: State, name: str, *others: str, before: Moves = ()) -> tuple[
             refuse_nowhere(state, moved, [part])
         for moved, part in moves:
             move(state, moved, part)
-        return held.noticed()
+    except EventError:
+        held.put_back(clock)
+        raise
+    return held.noticed()
 
 
 def refuse_nowhere(state: State, name: str, parts: Sequence[MotionPart]) -> None:

@@ -150,7 +150,7 @@ class Slam(Estimate):
         if event.robot not in state.robots:
             names = sorted(state.robots)
             raise EventError(f"{label_of_event(event)}: robot is {event.robot!r}, expected one of {names}")
-        if before is not None and event.t_ns - before > self.state.settings.longest_pause_s * 1e9:
+        if before is not None and event.t_ns - before > state.settings.longest_pause_s * 1e9:
             self._refuse_ahead(event, before)
         try:
             report: Report = take(event)
@@ -193,13 +193,18 @@ class Slam(Estimate):
         moving, report = state.moving[event.robot], Report(event)
         refuse_bad_control(event, moving.motion)
         state.t_ns = event.t_ns
-        with moving.held as held:
+        held = moving.held
+        clock = held.snapshot()
+        try:
             parts = held.accept(event)
             if len(parts) > 1:
                 moves.refuse_nowhere(state, event.robot, parts)
             for part in parts:
                 moves.move(state, event.robot, part)
-        report.gaps = moving.held.noticed()
+        except EventError:
+            held.put_back(clock)
+            raise
+        report.gaps = held.noticed()
         return report
 
     def _scan(self, event: Scan) -> Report:

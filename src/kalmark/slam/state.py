@@ -329,7 +329,7 @@ class State:
         """Correct the map.  Raises DivergedError if the robot is lost for good."""
         done = (estimator or self.estimator).correct(self.map, update)
         if self.may_grow and isinstance(self.map, StochasticMap):
-            self.balance.add_correction(update.slots.tolist(), update.d, done.z.size, self.map.n)
+            self.balance.add_correction(update.slots, update.d, done.z.size, self.map.n)
         if not done.valid:
             self.refuse_lost(event)
         return done
