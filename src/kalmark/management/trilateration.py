@@ -11,76 +11,29 @@ docs/range_only.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 
-from kalmark.arrays import Array, Index
+from kalmark.arrays import Array
 from kalmark.declare import Probability, Within, register
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import POINT2
 from kalmark.management.pending import OTHERS, Step
 from kalmark.models.observe import sensor_pose
+from kalmark.models.range_fit import Fits, RangeProblem, model_of
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.scan import ScanContext, Start
 from kalmark.tracks.track import Pending
 
-STEPS = 25  # of a search,
-ROUGH, SETTLED = 1e-6, 1e-12  # which is over when the next one changes chi-square by less; rough while they compete,
-TOGETHER = 0.01  # and in which positions come together that are so many sigmas apart
+ROUGH, SETTLED = 1e-6, 1e-12  # a search is over when the next step changes chi-square by less; rough while many compete
 OUTLIER = 0.9999  # a set of ranges that fits worse than this probability has one that is wrong
 BULGE = 0.03  # how far a circle may leave its tangent within a sigma of the position, in sigmas of the range
 OUT = 3.0  # sigmas from the minimum at which its shape is tested,
 AROUND = 2 * np.pi * np.arange(24) / 24  # in these directions (0: the longest axis),
 SHAPE = 2.0  # and by how much less the likelihood may fall off there than a Gaussian's, OUT^2
-
-
-class Fits(NamedTuple):
-    """Fit of J positions l (J, 2) to n ranges: `cost` = -2 log likelihood and chi-square (J,), residuals z (J, n).
-
-    `H` (J, n, 2) is with respect to the position, `H_w` (J, n, k + 2) to the sensor's own parameters in the map and the
-    place of each range, `inverse` (J, n, n) that of the covariance, and `R` (J, n) the ranges' variances, as the
-    position would have them.
-    """
-
-    l: Array
-    cost: Array
-    chi2: Array
-    z: Array
-    H: Array
-    H_w: Array
-    inverse: Array
-    R: Array
-
-    def of(self, j: int | Index) -> Fits:
-        """Return that of one position, or of some."""
-        return Fits(*(each[j] for each in self))
-
-    @property
-    def information(self) -> Array:
-        """The information matrix (2, 2) of one position."""
-        return self.H.T @ self.inverse @ self.H
-
-
-class RangeProblem(NamedTuple):
-    """Fit of positions (J, 2) to ranges from the sensor's places (n, 2), and the blocks that those depend on.
-
-    `S_x` (n, k + 2, .) is the Jacobian of the sensor's k own parameters and each place, `S` (n, k + 2, n, k + 2) the
-    covariance of these.
-    """
-
-    slots: list[int]
-    S_x: Array
-    S: Array
-    fit: Callable[[Array], Fits]
-    places: Array
-
-    @property
-    def own(self) -> int:
-        """Number of the sensor's parameters in the map."""
-        return self.S_x.shape[1] - 2
 
 
 @register("initialization", "trilateration")
@@ -135,7 +88,7 @@ class Trilateration:
         now, damping = problem.fit(starts), np.full(len(starts), 1e-3)
         most = chi2_gate(OUTLIER, max(1, len(kept) - 2))
         for all_ in (False, True):  # where the likeliest minimum does not determine it, the others are not sought
-            now, damping = _search(problem.fit, now, damping, ROUGH, all_)
+            now, damping = problem.search(now, damping, ROUGH, all_)
             best = now.of(int(np.argmin(now.cost)))
             if best.chi2 <= most and not _is_determined(problem, best, bent):
                 return Step("deferred", f"{len(kept)} ranges do not determine yet where it is")
@@ -149,7 +102,7 @@ class Trilateration:
         if (apart & (now.cost - best.cost < -2 * math.log(self.odds))).any():
             return Step("deferred", f"{len(kept)} ranges fit two positions")
         first = np.argmin(now.cost, keepdims=True)
-        best = _search(problem.fit, now.of(first), damping[first], SETTLED)[0].of(0)
+        best = problem.search(now.of(first), damping[first], SETTLED)[0].of(0)
         W = np.linalg.solve(best.information, best.H.T @ best.inverse)
         parts = tuple((slot, len(scan.map.rows(slot))) for slot in problem.slots)
         H_x = np.einsum("iw,iwx->ix", best.H_w, problem.S_x)
@@ -186,62 +139,16 @@ def _problem(scan: ScanContext, kept: Sequence[Measurement]) -> RangeProblem:
         S_x[i, own:, first + 3 * i : first + 3 * i + 3] = scan.estimator.pose_jacobian(map_, slot, T_r[:2])
         if channel.mount >= 0:
             S_x[i, own:, :3] = T_s[:2]
-    S = np.einsum("iwx,xy,jvy->iwjv", S_x, P, S_x, optimize=True)
+    X = S_x.reshape(n * (own + 2), -1)
+    S = (X @ P @ X.T).reshape(n, own + 2, n, own + 2)
     y, variance = np.array([m.y[0] for m in kept]), np.array([m.R[0, 0] for m in kept])
     varies = np.array([_varies(scan, m) for m in kept])
-
-    def fit(l: Array) -> Fits:
-        v = (l[:, None] - places).reshape(-1, 2)
-        e, E_v = sensor.expect(v)
-        H = E_v.reshape(-1, n, 2)
-        H_w = np.concatenate([sensor.parameters_jacobian(v).reshape(-1, n, own), -H], axis=2) if own else -H
-        R = np.tile(variance, (len(l), 1))
-        if varies.any():
-            R[:, varies] = sensor.range_variance(e).reshape(-1, n)[:, varies]
-        Sigma = np.einsum("jiw,iwkv,jkv->jik", H_w, S, H_w)
-        Sigma[:, range(n), range(n)] += R
-        z, inverse = y - e.reshape(-1, n), np.asarray(np.linalg.inv(Sigma), dtype=np.float64)
-        chi2 = np.einsum("ji,jik,jk->j", z, inverse, z)
-        return Fits(l, chi2 + np.linalg.slogdet(Sigma)[1], chi2, z, H, H_w, inverse, R)
-
-    return RangeProblem(slots, S_x, S, fit, places)
-
-
-def _search(
-    fit: Callable[[Array], Fits], now: Fits, damping: Array, settled: float, all_: bool = True
-) -> tuple[Fits, Array]:
-    """Return positions (J, 2) after Levenberg's and Marquardt's steps, and the damping (J,) of these.
-
-    The search is over when all of them have settled in a minimum, or the likeliest one; of those that come together one
-    is left.
-    """
-    for _ in range(STEPS):
-        J = now.H.transpose(0, 2, 1) @ now.inverse
-        g, A = J @ now.z[:, :, None], J @ now.H
-        A[:, [0, 1], [0, 1]] += 1e-12
-        decrease = (g * np.linalg.solve(A, g)).sum(axis=(1, 2))  # of chi-square by a step without damping
-        if decrease.max() < settled or (not all_ and decrease[np.argmin(now.cost)] < settled):
-            break
-        first = _first_of_each(now.l, A)
-        now, damping, g, A = now.of(first), damping[first], g[first], A[first]
-        A[:, [0, 1], [0, 1]] *= 1 + damping[:, None]
-        new = fit(now.l + np.linalg.solve(A, g)[:, :, 0])
-        better = np.einsum("ji,jik,jk->j", new.z, now.inverse, new.z) < now.chi2  # Sigma as it was
-        damping = np.where(better, 0.1 * damping, 10 * damping)
-        now = Fits(*(np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(new, now, strict=True)))
-    return now, damping
-
-
-def _first_of_each(l: Array, A: Array) -> Index:
-    """Return which positions l (J, 2) are the first of those within TOGETHER sigmas, by information matrices A."""
-    gaps = l - l[:, None]
-    near = np.einsum("ijk,ikm,ijm->ij", gaps, A, gaps) < TOGETHER**2
-    return np.flatnonzero(near.argmax(axis=1) == np.arange(len(l)))
+    return RangeProblem(slots, S_x, S, places, (y, variance, varies), model_of(sensor, own > 0, bool(varies.any())))
 
 
 def _is_determined(problem: RangeProblem, best: Fits, bent: bool) -> bool:
     """Return whether the likelihood about a minimum is that of a Gaussian."""
-    return _flat(best, problem) and _gaussian(problem.fit, best, best.information, bent)
+    return _flat(best, problem) and _gaussian(problem, best, best.information, bent)
 
 
 def _flat(best: Fits, problem: RangeProblem) -> bool:
@@ -260,7 +167,7 @@ def _flat(best: Fits, problem: RangeProblem) -> bool:
     return bool(np.median(bulge * np.hypot(*best.H.T) / np.sqrt(best.R)) < BULGE)
 
 
-def _gaussian(fit: Callable[[Array], Fits], best: Fits, information: Array, bent: bool) -> bool:
+def _gaussian(problem: RangeProblem, best: Fits, information: Array, bent: bool) -> bool:
     """Return whether the likelihood falls off at least as that of a Gaussian does.
 
     An unknown scale, and noise that grows with the range, make valleys that are `bent`: they leave the longest axis and
@@ -269,4 +176,4 @@ def _gaussian(fit: Callable[[Array], Fits], best: Fits, information: Array, bent
     values, vectors = np.linalg.eigh(information)
     angles = AROUND if bent else AROUND[[0, len(AROUND) // 2]]
     steps = OUT * np.column_stack([np.cos(angles), np.sin(angles)]) / np.sqrt(values)
-    return bool((fit(best.l + steps @ vectors.T).cost - best.cost > OUT**2 - SHAPE).all())
+    return bool((problem.fit(best.l + steps @ vectors.T).cost - best.cost > OUT**2 - SHAPE).all())
