@@ -1,7 +1,7 @@
 """A robot that may be anywhere in a known map, or is carried away in it or in its own: how soon is it placed?
 
     python benchmarks/anywhere.py                      # every case, 20 seeds
-    python benchmarks/anywhere.py --cases tags rays --runs 5
+    python benchmarks/anywhere.py --cases rays "corners of tags" --runs 5
 
 `start`: the log begins at a random time of a simulated one; of its start is known that it is in the world, turned in
 any way.  `known` and `own`: a piece is cut out of the log (benchmarks/carried.py).  A line a case: the runs of which

@@ -447,7 +447,7 @@ def gaps() -> Iterator[Figure]:
     for way, said in (
         ("start", "a start anywhere in a known map"),
         ("known", "carried away in a known map"),
-        ("own", "in its own map"),
+        ("own", "carried away in its own map"),
     ):
         for case, within in (("points", 30), ("points_no_ids", 30), ("rays", 30), ("four_ranges", 30), ("points_of_space", 2),
                              ("rays_of_space", 2), ("ranges_of_space", 2), ("corners_of_tags", 2), ("poses_of_tags", 2)):  # fmt: skip
