@@ -24,6 +24,8 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter import gauge_transport, parallax
 from kalmark.filter.gauge_transport import (
+    TURNING,
+    Turning,
     call_carry,
     call_displacement,
     call_heading_last,
@@ -56,7 +58,6 @@ from kalmark.filter.observed_block import (
     innovation,
     joint_innovation,
     least_squares,
-    near_observations,
     observation_of,
     observed_block,
     ravel,
@@ -74,12 +75,18 @@ Routines = tuple[int, ...]  # 13 addresses, see `routines`
 Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
 Sizes = tuple[int, int, int, int, int, int]  # see `observed_block`
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
+Block = tuple[Index, Table, Array, Array, Sizes, Turning]  # of what a scan observes: rows in P, atoms, mean, P_ss
+Placed = tuple[Table, Index, Index, Array, int]  # atoms of a mean, rows of an observed block, places of its head, x, n
+Coordinates = tuple[
+    Placed, Array, Index, Array, Array, Array, parallax.Baselines, tuple[Turning, Sizes]
+]  # where a mean is placed, head, theta, L, R_r, generator, baselines, what turns: see `coordinates`
 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
+BLOCK = f"Tuple((i8[::1], i8[:, ::1], f8[::1], f8[:, ::1], UniTuple(i8, 6), {TURNING}))"
 TO_ITERATE = (
-    f"{VIEW}, UniTuple(i8, 13), UniTuple(i8, 6), i8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], "
-    "Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
+    f"{VIEW}, UniTuple(i8, 13), {BLOCK}, f8[:, ::1], "
+    "f8[:, :, ::1], Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
 )
 ITERATE = signature_of(f"Tuple((f8[:, ::1], f8[:, ::1], f8[::1], b1))({TO_ITERATE})")
 TO_CORRECT = (  # all but the last argument
@@ -155,9 +162,81 @@ def take_indices(index: Index, rows: Index) -> Index:
     return out
 
 
+@compiled
+def predicted(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array, Block, Linear]:
+    """Return what is missing e and z of each observation, the observed block, and the scan linearised at its mean."""
+    _robot, _mount, slots, d, y, R, _gate = scan
+    index, table, mean, sizes = observed_rows(map_, scan, slots)
+    head = sizes[1]
+    e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
+    P_ss = submatrix(map_[1], index)
+    linear = observation_of(z, E_r, E_l, P_ss, R)
+    return e, z, (index, table, mean, P_ss, sizes, turning_rows(table, sizes, linear[1])), linear
+
+
+@compiled
+def coordinates(
+    model: Any, ways: Routines, turns: tuple[Turning, Sizes], placed: Placed, P: Array, iterates: bool
+) -> Coordinates:  # fmt: skip
+    """Return the error coordinates of a mean x whose covariance are the first n rows of P, as `retract_in` takes them.
+
+    In a correction that `iterates` inverse distances are corrected by their parallax: a single step is worse off with
+    it.  docs/invariant.md, docs/bearing_only.md.
+    """
+    (turning, sizes), (table, rows, places, x, n) = turns, placed
+    axes, h, head = sizes[2], sizes[3], take_values(x, places)
+    theta, R_r = take_indices(rows, turning[0]), rotation_at(x, places[0], axes)
+    B = take_rows(P, theta, n)
+    L = call_regression(ways[_REGRESSION], (B, theta, table, turning, axes, R_r, ways[_SPREAD] != 0))
+    generator = call_generator(ways[_GENERATOR], (table, x, n, axes, head))
+    depths = inverse_distance_table(table if iterates and ways[_SPREAD] != 0 else table[:0])
+    s, S, c2 = head, L, head  # of the types of a sensor's place and Jacobian, which only inverse distances need
+    if len(depths):
+        s, S = sensor_at(model, head, ways[_SENSOR_AT])
+        c2 = parallax.call_spread(ways[_SPREAD], (P, rows[:h], x, s, S, depths))
+    return placed, head, theta, L, R_r, generator, (depths, s, S, c2), turns
+
+
+@compiled
+def coordinates_of(model: Any, map_: Map, scan: Scan, block: Block, iterates: bool) -> Coordinates:
+    """Return the error coordinates of a whole map, of which a scan observes a block."""
+    x, P, n, blocks, atoms, _axes, ways = map_
+    index, _table, _mean, _P_ss, sizes, turning = block
+    pose, places = sizes[0], np.empty(sizes[1], np.int64)
+    for i in range(len(places)):
+        places[i] = blocks[scan[0], 0] + i if i < pose else blocks[scan[1], 0] + i - pose
+    return coordinates(model, ways, (turning, sizes), (atoms, index, places, x.copy(), n), P, iterates)
+
+
+@compiled
+def retract_in(
+    model: Any, ways: Routines, prior: Coordinates, x: Array, correction: Array
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Move a mean x by a correction (n,); return how the error coordinates change, and the sensor's place and Jacobian.
+
+    The errors d of those that turn, the rows theta, change the others by a d_theta, a (n, k).  The sensor is that of
+    inverse distances, where there are any.
+    """
+    (table, rows, places, before, n), head, theta, L, R_r, then, baselines, (turning, sizes) = prior
+    axes, h, level = sizes[2], sizes[3], sizes[5]
+    own = take_values(correction, rows)
+    turn = gauge(head, own, turning, axes)
+    step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, rows[0] + 3))
+    E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_values(step, rows), turning, axes))
+    call_retract(ways[_RETRACT], (table, x, step, turn))
+    call_carry(ways[_CARRY], (table, x, L, W, d))
+    now = call_generator(ways[_GENERATOR], (table, x, n, axes, head))
+    moved = table, now, then, L, E, d, turning, theta, R_r, rotation_at(x, places[0], axes), level
+    a = call_displacement(ways[_DISPLACEMENT], moved)
+    s, S = baselines[1], baselines[2]
+    if len(baselines[0]):
+        s, S = sensor_at(model, take_values(x, places), ways[_SENSOR_AT])
+        parallax.call_retract(ways[_RETRACT_PARALLAX], (x, before, baselines, correction, own[:h], s))
+    return a, s, S
+
+
 def iterate(
-    model: Any, ways: Routines, sizes: Sizes, table: Table, mean: Array, P_ss: Array, y: Array,
-    R: Array, linear: Linear, limits: tuple[int, float],
+    model: Any, ways: Routines, block: Block, y: Array, R: Array, linear: Linear, limits: tuple[int, float]
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Relinearise on the observed block only: return H, M = L^-1 of its Z, and the innovation to fuse.
 
@@ -168,27 +247,15 @@ def iterate(
     and halves each step that raises it (docs/invariant.md).
 
     The prior covariance P_ss is in the error coordinates of the prior mean; the Jacobian H_j at the iterate x_j is in
-    those of x_j, so H_j is transported: H~_j = H_j (I + (generator(x_j) - generator(x)) e_theta'), and likewise carried
-    back where inverse distances are corrected by their parallax.
+    those of x_j, so H_j is transported: H~_j = H_j (I + a e_theta'), `retract_in`, and likewise carried back where
+    inverse distances are corrected by their parallax.
     """
-    (_pose, head, axes, h, others, level), (most, tolerance) = sizes, limits
-    k, p = len(y), R.shape[1]
-    turning = turning_rows(table, sizes, linear[1])
-    theta = turning[0]
-    correction, weights, origin = np.zeros(len(P_ss)), np.zeros(len(P_ss)), mean[:3].copy()
-    R_r = rotation_at(mean, 0, axes)
-    B = take_rows(P_ss, theta, len(P_ss))
-    L = call_regression(ways[_REGRESSION], (B, theta, table, turning, axes, R_r, ways[_SPREAD] != 0))
-    then = call_generator(ways[_GENERATOR], (table, mean, len(P_ss), axes, origin))
-    parallaxes = most > 1 and ways[_SPREAD] != 0  # a single step is worse off with them: docs/bearing_only.md
-    depths = inverse_distance_table(table if parallaxes else table[:0])
+    (_index, table, mean, P_ss, sizes, turning), (most, tolerance) = block, limits
+    head, behind, (k, p), n = sizes[1], sizes[3] + sizes[4], (len(y), R.shape[1]), len(P_ss)
     v, H, HP, Z = linear
-    s, S = s_j, S_j = v, HP  # of the types of a sensor's place and Jacobian, which only inverse distances need
-    baselines = (depths, s, S, s)
-    if len(depths):
-        s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
-        rows = np.arange(S.shape[1])
-        baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P_ss, rows, mean, s, S, depths)))
+    placed = table, np.arange(n), np.arange(head), mean, n
+    prior = coordinates(model, ways, (turning, sizes), placed, P_ss, most > 1)
+    theta, baselines, correction, weights = prior[2], prior[6], np.zeros(n), np.zeros(n)
     best, best_weights = correction, weights
     first = least = cost = cost_of(v.reshape(k, p), R, correction, weights)
     for j in range(2 * most):
@@ -197,25 +264,15 @@ def iterate(
                 break
             correction, weights = best, best_weights
         if j > 0:
-            x_j, turn = mean.copy(), gauge(mean, correction, turning, axes)
-            step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, 3))
-            E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, step, turning, axes))
-            call_retract(ways[_RETRACT], (table, x_j, step, turn))
-            call_carry(ways[_CARRY], (table, x_j, L, W, d))
-            if len(depths):
-                s_j, S_j = sensor_at(model, x_j[:head], ways[_SENSOR_AT])
-                d_head = correction[: S.shape[1]]
-                parallax.call_retract(ways[_RETRACT_PARALLAX], (x_j, mean, baselines, correction, d_head, s_j))
+            x_j = mean.copy()
+            a, s, S = retract_in(model, ways, prior, x_j, correction)
             _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, (len(mean) - head) // k), y)
             cost = cost_of(z, R, correction, weights)
-            H, v = stack_jacobians(E_r, E_l, len(P_ss)), ravel(z)
-            if len(depths):
-                parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s_j, S_j))
-            now = call_generator(ways[_GENERATOR], (table, x_j, len(P_ss), axes, origin))
-            moved = table, now, then, L, E, d, turning, theta, R_r, rotation_at(x_j, 0, axes), level
-            a = call_displacement(ways[_DISPLACEMENT], moved)
+            H, v = stack_jacobians(E_r, E_l, n), ravel(z)
+            if len(baselines[0]):
+                parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s, S))
             transport_rows(H, v, a, theta, correction)
-            HP, Z = joint_innovation(H, P_ss, R, h + others)
+            HP, Z = joint_innovation(H, P_ss, R, behind)
         M, positive = cholesky_inverse(Z)
         if not positive:
             break
@@ -235,21 +292,18 @@ compiled_iterate = compiled(iterate)
 
 
 def iterated(
-    model: Any, ways: Routines, sizes: Sizes, table: Table, mean: Array, P_ss: Array, y: Array,
-    R: Array, linear: Linear, limits: tuple[int, float],
+    model: Any, ways: Routines, block: Block, y: Array, R: Array, linear: Linear, limits: tuple[int, float]
 ) -> tuple[Array, Array, Array, bool]:  # fmt: skip
     """Return what `iterate` returns, compiled for a compiled model."""
     if isinstance(model, tuple):
-        return call_iterate(ways[_ITERATE], (model, ways, sizes, table, mean, P_ss, y, R, linear, limits))
-    return iterate(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
+        return call_iterate(ways[_ITERATE], (model, ways, block, y, R, linear, limits))
+    return iterate(model, ways, block, y, R, linear, limits)
 
 
 @overload(iterated, strict=False)  # type: ignore[untyped-decorator]
-def _compiled_iterated(
-    model: Any, ways: Any, sizes: Any, table: Any, mean: Any, P_ss: Any, y: Any, R: Any, linear: Any, limits: Any
-) -> Any:
-    def call(model, ways, sizes, table, mean, P_ss, y, R, linear, limits):  # type: ignore[no-untyped-def]
-        return call_iterate(ways[_ITERATE], (model, ways, sizes, table, mean, P_ss, y, R, linear, limits))
+def _compiled_iterated(model: Any, ways: Any, block: Any, y: Any, R: Any, linear: Any, limits: Any) -> Any:
+    def call(model, ways, block, y, R, linear, limits):  # type: ignore[no-untyped-def]
+        return call_iterate(ways[_ITERATE], (model, ways, block, y, R, linear, limits))
 
     return call if isinstance(model, types.BaseTuple) else None
 
@@ -292,67 +346,65 @@ def product_left(E_r: Array, E_l: Array, rows: Array, at: int, V: Array, index: 
 
 
 @compiled
+def near_scan(scan: Scan, near: Flags, count: int) -> Scan:
+    """Return the scan with those `count` observations alone that are `near` (K,)."""
+    robot, mount, slots, d, y, R, gate = scan
+    p = R.shape[1]
+    slots_near, y_near, R_near = np.empty(count, np.int64), np.empty((count, y.shape[1])), np.empty((count, p, p))
+    to = 0
+    for i in range(len(near)):
+        if near[i]:
+            slots_near[to] = slots[i]
+            for a in range(y.shape[1]):
+                y_near[to, a] = y[i, a]
+            for a in range(p):
+                for b in range(p):
+                    R_near[to, a, b] = R[i, a, b]
+            to += 1
+    return robot, mount, slots_near, d, y_near, R_near, gate
+
+
+@compiled
 def invariant(
     model: Any, map_: Map, scan: Scan, limits: tuple[int, float]
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
-    """Correct with one scan: gate, iterate, fuse, retract, transport; inverse distances by their parallax.
+    """Correct with one scan: gate, iterate, fuse.  docs/invariant.md, docs/bearing_only.md.
 
-    docs/invariant.md, docs/bearing_only.md.  Returns e, z, Z, d2 at the prediction, which were fused, and whether all
-    covariances are valid: an observation whose Z is none is left out, and if that of all together is none, nothing is
-    fused.
+    Returns e, z, Z, d2 at the prediction, which were fused, and whether all covariances are valid: an observation whose
+    Z is none is left out, and if that of all together is none, nothing is fused.
     """
-    x, P, n, blocks, atoms, axes, ways = map_
-    robot, mount, slots, d, y, R, gate = scan
-    index, table, mean, sizes = observed_rows(map_, scan, slots)
-    head, h = sizes[1], sizes[3]
-    e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
-    P_ss = submatrix(P, index)
-    linear = observation_of(z, E_r, E_l, P_ss, R)
+    e, z, block, linear = predicted(model, map_, scan)
     Z = diagonal_blocks(linear[3], z.shape[1])
     d2, valid = squared_distances(Z, z)
-    near, count = within_gate(d2, gate)
+    near, count = within_gate(d2, scan[6])
     if count == 0:
         return e, z, Z, d2, near, valid
     if count < len(near):
-        slots, y, R = near_observations(near, count, slots, y, R)
-        index, table, mean, sizes = observed_rows(map_, scan, slots)
-        P_ss = submatrix(P, index)
-        _e, z_near, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(count, d), y)
-        linear = observation_of(z_near, E_r, E_l, P_ss, R)
-    H, M, v, positive = iterated(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
+        scan = near_scan(scan, near, count)
+        _e, _z, block, linear = predicted(model, map_, scan)
+    H, M, v, positive = iterated(model, map_[6], block, scan[4], scan[5], linear, limits)
     if not positive:
         return e, z, Z, d2, within_gate(d2, -1.0)[0], False
-    at, origin = blocks[robot, 0], mean[:3].copy()
-    turning = turning_rows(table, sizes, linear[1])
-    theta = take_indices(index, turning[0])
-    R_r = rotation_at(x, at, axes)
-    B = take_rows(P, theta, n)
-    L = call_regression(ways[_REGRESSION], (B, theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0))
-    then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    V, correction = gain(sparse_product(H, take_rows(P, index, n), h + sizes[4], count), M, v)
-    depths = inverse_distance_table(atoms if limits[0] > 1 and ways[_SPREAD] != 0 else atoms[:0])
-    s, S = v, H  # of the types, as in `iterate`
-    rows, baselines, x_before = index[:h], (depths, s, S, s), x
-    if len(depths):
-        s, S = sensor_at(model, mean[:head], ways[_SENSOR_AT])
-        x_before = x.copy()
-        baselines = (depths, s, S, parallax.call_spread(ways[_SPREAD], (P, rows, x, s, S, depths)))
-    own = take_values(correction, index)
-    turn = gauge(mean, own, turning, axes)
-    step = call_heading_last(ways[_HEADING_LAST], (correction, turn, sizes[5], blocks[robot, 2] + 3))
-    E, W, d_lean = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_values(step, index), turning, axes))
-    call_retract(ways[_RETRACT], (atoms, x, step, turn))
-    call_carry(ways[_CARRY], (atoms, x, L, W, d_lean))
-    now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5]
-    a = call_displacement(ways[_DISPLACEMENT], moved)
-    downdate_and_transport(P, V, a, theta)
-    if len(depths):
-        observer = observed_block(x, blocks, atoms, robot, mount, slots[:0], d)[2]
-        s, S = sensor_at(model, observer, ways[_SENSOR_AT])
-        parallax.call_retract(ways[_RETRACT_PARALLAX], (x, x_before, baselines, correction, own[:h], s))
-        parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, rows, x_before, x, baselines, s, S))
+    fuse(model, map_, scan, block, (H, M, v), limits[0] > 1)
     return e, z, Z, d2, near, valid
+
+
+@compiled
+def fuse(
+    model: Any, map_: Map, scan: Scan, block: Block, linear: tuple[Array, Array, Array], iterates: bool
+) -> None:  # fmt: skip
+    """Set x <- x + K v and P <- P - K Z K' by H, M = L^-1, Z = L L', and v, in the coordinates of the corrected mean.
+
+    [S] (28)-(30).
+    """
+    (x, P, n, _blocks, _atoms, _axes, ways), (H, M, v) = map_, linear
+    index, _table, _mean, _P_ss, (_pose, _head, _gauge, h, others, _level), _turning = block
+    prior = coordinates_of(model, map_, scan, block, iterates)
+    V, correction = gain(sparse_product(H, take_rows(P, index, n), h + others, len(scan[4])), M, v)
+    a, s, S = retract_in(model, ways, prior, x, correction)
+    downdate_and_transport(P, V, a, prior[2])
+    if len(prior[6][0]):
+        parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, index[:h], prior[0][3], x, prior[6], s, S))
 
 
 @compiled
@@ -413,14 +465,8 @@ def robust_noise(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
 @compiled
 def scan_fit(model: Any, map_: Map, scan: Scan, limits: tuple[int, float]) -> tuple[float, float]:
     """Return d2 = v' Z^-1 v of a scan as a whole, where it is linearised in the end, and log |Z|; inf if not valid."""
-    P, ways = map_[1], map_[6]
-    _robot, _mount, slots, d, y, R, _gate = scan
-    index, table, mean, sizes = observed_rows(map_, scan, slots)
-    head = sizes[1]
-    _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
-    P_ss = submatrix(P, index)
-    linear = observation_of(z, E_r, E_l, P_ss, R)
-    _H, M, v, positive = iterated(model, ways, sizes, table, mean, P_ss, y, R, linear, limits)
+    _e, _z, block, linear = predicted(model, map_, scan)
+    _H, M, v, positive = iterated(model, map_[6], block, scan[4], scan[5], linear, limits)
     if not positive:
         return np.inf, np.inf
     w, log_det = M @ v, 0.0
@@ -439,50 +485,39 @@ def correct_by_average(
     it would be alone; inverse distances are corrected as they are.  Returns d2 (K,) of the first matching's pairs, each
     for itself, NaN for none, and whether the covariances are valid.
     """
-    x, P, n, blocks, atoms, axes, ways = map_
-    robot, _mount, slots, d, y, R, _gate = scan
-    index, table, mean, sizes = observed_rows(map_, scan, slots[:0])
-    (_pose, head, _axes, h, others, _level), q = sizes, R.shape[1]
-    V, D, H = np.zeros((q * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, h))
+    x, P, n, _blocks, atoms, _axes, ways = map_
+    robot, mount, slots, d, y, R, gate = scan
+    V, D, H = np.zeros((R.shape[1] * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, 0))
     d2, used = np.full(len(y), np.nan), 0
     for i in range(len(pairs)):
         rows = np.flatnonzero(pairs[i] >= 0)
         if len(rows) == 0:
             continue
-        index, table, mean, sizes = observed_rows(map_, scan, slots[pairs[i][rows]])
-        _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(rows), d), y[rows])
+        matched = robot, mount, slots[pairs[i][rows]], d, y[rows], R[rows], gate
+        _e, z, block, linear = predicted(model, map_, matched)
         if i == 0:
-            d2[rows] = innovation(P, index, E_r, E_l, R[rows], z)[1]
-        S = submatrix(P, index)
-        linear = observation_of(z, E_r, E_l, S, R[rows])
-        H, M, v, positive = iterated(model, ways, sizes, table, mean, S, y[rows], R[rows], linear, limits)
+            d2[rows] = squared_distances(diagonal_blocks(linear[3], z.shape[1]), z)[0]
+        H, M, v, positive = iterated(model, ways, block, matched[4], matched[5], linear, limits)
         if not positive:
             return d2, False
-        V_i, D[:, i] = gain(sparse_product(H, take_rows(P, index, n), h + others, len(rows)), M, v)
+        index, sizes = block[0], block[4]
+        V_i, D[:, i] = gain(sparse_product(H, take_rows(P, index, n), sizes[3] + sizes[4], len(rows)), M, v)
         V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
         used += len(V_i)
-    index, table, mean, sizes = observed_rows(map_, scan, slots[:0])
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
-    at, origin, turning = blocks[robot, 0], mean[:3].copy(), turning_rows(table, sizes, H)
-    theta, own = take_indices(index, turning[0]), correction[index]
-    R_r = rotation_at(x, at, axes)
-    B = take_rows(P, theta, n)
-    L = call_regression(ways[_REGRESSION], (B, theta, atoms, turning, axes, R_r, ways[_SPREAD] != 0))
-    then = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-    step, turn = correction, gauge(mean, own, turning, axes) if transports else np.zeros(0)
-    if transports:
-        step = call_heading_last(ways[_HEADING_LAST], (correction, turn, sizes[5], blocks[robot, 2] + 3))
-    call_retract(ways[_RETRACT], (atoms, x, step, turn))
+    if not transports:
+        call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
+        downdate(P, V)
+        add_square(P, spread)
+        return d2, True
+    index, table, mean, sizes = observed_rows(map_, scan, slots[:0])
+    block = index, table, mean, np.zeros((0, 0)), sizes, turning_rows(table, sizes, H)
+    prior = coordinates_of(model, map_, scan, block, False)
+    a = retract_in(model, ways, prior, x, correction)[0]
     downdate(P, V)
     add_square(P, spread)
-    if transports:
-        E, W, d_lean = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_values(step, index), turning, axes))
-        call_carry(ways[_CARRY], (atoms, x, L, W, d_lean))
-        now = call_generator(ways[_GENERATOR], (atoms, x, n, axes, origin))
-        moved = atoms, now, then, L, E, d_lean, turning, theta, R_r, rotation_at(x, at, axes), sizes[5]
-        a = call_displacement(ways[_DISPLACEMENT], moved)
-        transport(P, a, theta)
+    transport(P, a, prior[2])
     return d2, True
 
 

@@ -241,24 +241,6 @@ def within_gate(d2: Array, gate: float) -> tuple[Flags, int]:
 
 
 @compiled
-def near_observations(near: Flags, count: int, slots: Index, y: Array, R: Array) -> tuple[Index, Array, Array]:
-    """Return those `count` of slots (K,), measurements y (K, m) and noises R (K, p, p) that are `near`."""
-    p = R.shape[1]
-    slots_near, y_near, R_near = np.empty(count, np.int64), np.empty((count, y.shape[1])), np.empty((count, p, p))
-    to = 0
-    for i in range(len(near)):
-        if near[i]:
-            slots_near[to] = slots[i]
-            for a in range(y.shape[1]):
-                y_near[to, a] = y[i, a]
-            for a in range(p):
-                for b in range(p):
-                    R_near[to, a, b] = R[i, a, b]
-            to += 1
-    return slots_near, y_near, R_near
-
-
-@compiled
 def transport_rows(H: Array, v: Array, a: Array, theta: Index, correction: Array) -> None:
     """Transport the rows of H from an iterate to the mean, H <- H (I + a e_theta'), then v += H correction."""
     n, k = a.shape
