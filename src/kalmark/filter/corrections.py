@@ -73,9 +73,9 @@ from kalmark.models.observe import VIEW, linearize, sensor_address, sensor_at
 
 Routines = tuple[int, ...]  # 13 addresses, see `routines`
 Map = tuple[Array, Array, int, Table, Table, int, Routines]  # x, P, n, blocks, atoms, axes, routines
-Sizes = tuple[int, int, int, int, int, int]  # see `observed_block`
+Sizes = tuple[int, int, int, int, int, int]  # see `predicted`
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
-Block = tuple[Index, Table, Array, Array, Sizes, Turning]  # of what a scan observes: rows in P, atoms, mean, P_ss
+Block = tuple[Index, Index, Table, Array, Array, Sizes, Turning]  # rows in P, places of the head in x, atoms, mean, P
 Placed = tuple[Table, Index, Index, Array, int]  # atoms of a mean, rows of an observed block, places of its head, x, n
 Coordinates = tuple[
     Placed, Array, Index, Array, Array, Array, parallax.Baselines, tuple[Turning, Sizes]
@@ -83,7 +83,7 @@ Coordinates = tuple[
 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
-BLOCK = f"Tuple((i8[::1], i8[:, ::1], f8[::1], f8[:, ::1], UniTuple(i8, 6), {TURNING}))"
+BLOCK = f"Tuple((i8[::1], i8[::1], i8[:, ::1], f8[::1], f8[:, ::1], UniTuple(i8, 6), {TURNING}))"
 TO_ITERATE = (
     f"{VIEW}, UniTuple(i8, 13), {BLOCK}, f8[:, ::1], "
     "f8[:, :, ::1], Tuple((f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1])), Tuple((i8, f8))"
@@ -127,51 +127,38 @@ def compile_correction(name: str, option: str, axes: int, inverse_depths: bool, 
 
 
 @compiled
-def observed_rows(map_: Map, scan: Scan, slots: Index) -> tuple[Index, Table, Array, Sizes]:
-    """Return the `observed_block` of these slots, the rows of other units that turn behind its head, and its sizes.
-
-    These are the numbers of the pose and of the head, the axes of the gauge, the rows of the head and of other units,
-    and whether the robot is an inertial unit whose gravity is known, whose errors of tilt turn.
-    """
-    x, _P, _n, blocks, atoms, axes, _ways = map_
-    index, table, mean = observed_block(x, blocks, atoms, scan[0], scan[1], slots, scan[3])
-    pose, head = head_sizes(blocks, atoms, scan[0], scan[1])
-    others, h = units(atoms, blocks[scan[0], 2]), 3 if pose == 3 else 6
-    h += blocks[scan[1], 3] if scan[1] >= 0 else 0
-    if len(others):
-        index, table = extend_rows(index, table, h, others)
-    level = is_level(atoms, blocks[scan[0], 4], blocks[scan[0], 5])
-    return index, table, mean, (pose, head, axes, h, len(others), level)
-
-
-@compiled
-def take_values(values: Array, index: Index) -> Array:
-    """Return values[index]."""
-    out = np.empty(len(index))
-    for i in range(len(index)):
-        out[i] = values[index[i]]
-    return out
-
-
-@compiled
-def take_indices(index: Index, rows: Index) -> Index:
-    """Return index[rows]."""
-    out = np.empty(len(rows), np.int64)
+def take_entries(values: Any, rows: Index) -> Any:
+    """Return values[rows]."""
+    out = np.empty(len(rows), values.dtype)
     for i in range(len(rows)):
-        out[i] = index[rows[i]]
+        out[i] = values[rows[i]]
     return out
 
 
 @compiled
 def predicted(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array, Block, Linear]:
-    """Return what is missing e and z of each observation, the observed block, and the scan linearised at its mean."""
-    _robot, _mount, slots, d, y, R, _gate = scan
-    index, table, mean, sizes = observed_rows(map_, scan, slots)
-    head = sizes[1]
+    """Return e and z of each observation, the block that a scan observes, and the scan linearised at the block's mean.
+
+    The rows of other units that turn are behind those of the head.  The sizes of a block are the numbers of the pose
+    and of the head, the axes of the gauge, the rows of the head and of other units, and whether the robot is an
+    inertial unit whose gravity is known, whose errors of tilt turn.
+    """
+    x, P, _n, blocks, atoms, axes, _ways = map_
+    robot, mount, slots, d, y, R, _gate = scan
+    index, table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    pose, head = head_sizes(blocks, atoms, robot, mount)
+    others, h = units(atoms, blocks[robot, 2]), 3 if pose == 3 else 6
+    h += blocks[mount, 3] if mount >= 0 else 0
+    if len(others):
+        index, table = extend_rows(index, table, h, others)
+    places = np.empty(head, np.int64)
+    for i in range(head):
+        places[i] = blocks[robot, 0] + i if i < pose else blocks[mount, 0] + i - pose
+    sizes = pose, head, axes, h, len(others), is_level(atoms, blocks[robot, 4], blocks[robot, 5])
     e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
-    P_ss = submatrix(map_[1], index)
+    P_ss = submatrix(P, index)
     linear = observation_of(z, E_r, E_l, P_ss, R)
-    return e, z, (index, table, mean, P_ss, sizes, turning_rows(table, sizes, linear[1])), linear
+    return e, z, (index, places, table, mean, P_ss, sizes, turning_rows(table, sizes, linear[1])), linear
 
 
 @compiled
@@ -184,8 +171,8 @@ def coordinates(
     it.  docs/invariant.md, docs/bearing_only.md.
     """
     (turning, sizes), (table, rows, places, x, n) = turns, placed
-    axes, h, head = sizes[2], sizes[3], take_values(x, places)
-    theta, R_r = take_indices(rows, turning[0]), rotation_at(x, places[0], axes)
+    axes, h, head = sizes[2], sizes[3], take_entries(x, places)
+    theta, R_r = take_entries(rows, turning[0]), rotation_at(x, places[0], axes)
     B = take_rows(P, theta, n)
     L = call_regression(ways[_REGRESSION], (B, theta, table, turning, axes, R_r, ways[_SPREAD] != 0))
     generator = call_generator(ways[_GENERATOR], (table, x, n, axes, head))
@@ -195,17 +182,6 @@ def coordinates(
         s, S = sensor_at(model, head, ways[_SENSOR_AT])
         c2 = parallax.call_spread(ways[_SPREAD], (P, rows[:h], x, s, S, depths))
     return placed, head, theta, L, R_r, generator, (depths, s, S, c2), turns
-
-
-@compiled
-def coordinates_of(model: Any, map_: Map, scan: Scan, block: Block, iterates: bool) -> Coordinates:
-    """Return the error coordinates of a whole map, of which a scan observes a block."""
-    x, P, n, blocks, atoms, _axes, ways = map_
-    index, _table, _mean, _P_ss, sizes, turning = block
-    pose, places = sizes[0], np.empty(sizes[1], np.int64)
-    for i in range(len(places)):
-        places[i] = blocks[scan[0], 0] + i if i < pose else blocks[scan[1], 0] + i - pose
-    return coordinates(model, ways, (turning, sizes), (atoms, index, places, x.copy(), n), P, iterates)
 
 
 @compiled
@@ -219,10 +195,10 @@ def retract_in(
     """
     (table, rows, places, before, n), head, theta, L, R_r, then, baselines, (turning, sizes) = prior
     axes, h, level = sizes[2], sizes[3], sizes[5]
-    own = take_values(correction, rows)
+    own = take_entries(correction, rows)
     turn = gauge(head, own, turning, axes)
     step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, rows[0] + 3))
-    E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_values(step, rows), turning, axes))
+    E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_entries(step, rows), turning, axes))
     call_retract(ways[_RETRACT], (table, x, step, turn))
     call_carry(ways[_CARRY], (table, x, L, W, d))
     now = call_generator(ways[_GENERATOR], (table, x, n, axes, head))
@@ -230,7 +206,7 @@ def retract_in(
     a = call_displacement(ways[_DISPLACEMENT], moved)
     s, S = baselines[1], baselines[2]
     if len(baselines[0]):
-        s, S = sensor_at(model, take_values(x, places), ways[_SENSOR_AT])
+        s, S = sensor_at(model, take_entries(x, places), ways[_SENSOR_AT])
         parallax.call_retract(ways[_RETRACT_PARALLAX], (x, before, baselines, correction, own[:h], s))
     return a, s, S
 
@@ -250,7 +226,7 @@ def iterate(
     those of x_j, so H_j is transported: H~_j = H_j (I + a e_theta'), `retract_in`, and likewise carried back where
     inverse distances are corrected by their parallax.
     """
-    (_index, table, mean, P_ss, sizes, turning), (most, tolerance) = block, limits
+    (_index, _places, table, mean, P_ss, sizes, turning), (most, tolerance) = block, limits
     head, behind, (k, p), n = sizes[1], sizes[3] + sizes[4], (len(y), R.shape[1]), len(P_ss)
     v, H, HP, Z = linear
     placed = table, np.arange(n), np.arange(head), mean, n
@@ -385,22 +361,23 @@ def invariant(
     H, M, v, positive = iterated(model, map_[6], block, scan[4], scan[5], linear, limits)
     if not positive:
         return e, z, Z, d2, within_gate(d2, -1.0)[0], False
-    fuse(model, map_, scan, block, (H, M, v), limits[0] > 1)
+    fuse_scan(model, map_, block, (H, M, v), count, limits[0] > 1)
     return e, z, Z, d2, near, valid
 
 
 @compiled
-def fuse(
-    model: Any, map_: Map, scan: Scan, block: Block, linear: tuple[Array, Array, Array], iterates: bool
+def fuse_scan(
+    model: Any, map_: Map, block: Block, linear: tuple[Array, Array, Array], count: int, iterates: bool
 ) -> None:  # fmt: skip
     """Set x <- x + K v and P <- P - K Z K' by H, M = L^-1, Z = L L', and v, in the coordinates of the corrected mean.
 
-    [S] (28)-(30).
+    `count` observations at once.  [S] (28)-(30).
     """
-    (x, P, n, _blocks, _atoms, _axes, ways), (H, M, v) = map_, linear
-    index, _table, _mean, _P_ss, (_pose, _head, _gauge, h, others, _level), _turning = block
-    prior = coordinates_of(model, map_, scan, block, iterates)
-    V, correction = gain(sparse_product(H, take_rows(P, index, n), h + others, len(scan[4])), M, v)
+    (x, P, n, _blocks, atoms, _axes, ways), (H, M, v) = map_, linear
+    index, places, _table, _mean, _P_ss, sizes, turning = block
+    h, placed = sizes[3], (atoms, index, places, x.copy(), n)
+    prior = coordinates(model, ways, (turning, sizes), placed, P, iterates)
+    V, correction = gain(sparse_product(H, take_rows(P, index, n), h + sizes[4], count), M, v)
     a, s, S = retract_in(model, ways, prior, x, correction)
     downdate_and_transport(P, V, a, prior[2])
     if len(prior[6][0]):
@@ -487,7 +464,7 @@ def correct_by_average(
     """
     x, P, n, _blocks, atoms, _axes, ways = map_
     robot, mount, slots, d, y, R, gate = scan
-    V, D, H = np.zeros((R.shape[1] * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs))), np.zeros((0, 0))
+    V, D = np.zeros((R.shape[1] * (pairs >= 0).sum(), n)), np.zeros((n, len(pairs)))
     d2, used = np.full(len(y), np.nan), 0
     for i in range(len(pairs)):
         rows = np.flatnonzero(pairs[i] >= 0)
@@ -500,20 +477,18 @@ def correct_by_average(
         H, M, v, positive = iterated(model, ways, block, matched[4], matched[5], linear, limits)
         if not positive:
             return d2, False
-        index, sizes = block[0], block[4]
+        index, places, _table, _mean, _P_ss, sizes, turning = block
         V_i, D[:, i] = gain(sparse_product(H, take_rows(P, index, n), sizes[3] + sizes[4], len(rows)), M, v)
         V[used : used + len(V_i)] = np.sqrt(weights[i]) * V_i
         used += len(V_i)
     correction = D @ weights
     spread = (D - correction.reshape(n, 1)) * np.sqrt(weights)
-    if not transports:
+    if not transports or used == 0:
         call_retract(ways[_RETRACT], (atoms, x, correction, np.zeros(0)))
         downdate(P, V)
         add_square(P, spread)
         return d2, True
-    index, table, mean, sizes = observed_rows(map_, scan, slots[:0])
-    block = index, table, mean, np.zeros((0, 0)), sizes, turning_rows(table, sizes, H)
-    prior = coordinates_of(model, map_, scan, block, False)
+    prior = coordinates(model, ways, (turning, sizes), (atoms, index, places, x.copy(), n), P, False)
     a = retract_in(model, ways, prior, x, correction)[0]
     downdate(P, V)
     add_square(P, spread)
