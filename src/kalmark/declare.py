@@ -291,11 +291,17 @@ def refuse(model: Any, key: str, wanted: str, what: str | None = None) -> ModelE
 
 
 def check_parameters(model: Any, what: str | None = None) -> None:
-    """Refuse a model, `what` in the message, with a parameter that is not as declared.  Raises ModelError."""
+    """Refuse a model, `what` in the message, with a parameter that is not as declared.  Raises ModelError.
+
+    Numbers of NumPy become Python's: a float32 would be squared in float32, and read from a file it is none.
+    """
     for parameter in parameters(type(model)):
-        wanted = parameter.refused(vars(model)[parameter.name])
+        value = vars(model)[parameter.name]
+        wanted = parameter.refused(value)
         if wanted:
             raise refuse(model, parameter.name, wanted, what)
+        if isinstance(value, np.generic):
+            object.__setattr__(model, parameter.name, value.item())
 
 
 def summary(model: type) -> str:
