@@ -376,6 +376,13 @@ def test_a_run_notes_a_sensor_that_its_configuration_cannot_have(sensor: Any, na
     assert run.notes[1:] and run.notes[1].startswith(f"config.yaml cannot have {lacking}")
 
 
+@pytest.mark.parametrize("value", [0.0, None])
+def test_a_linearity_index_of_zero_or_none_is_read_again(value: float | None, tmp_path: Path) -> None:
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle())], reparametrize=value)
+    for again in read_again(slam, tmp_path):
+        assert_same(again, slam)
+
+
 def test_numbers_of_numpy_are_those_that_a_configuration_has(tmp_path: Path) -> None:
     motion = km.motion.Unicycle(sigma_v_mps=np.float32(0.3))  # squared as a float32 it is another variance
     slam = km.Slam([km.Robot("r", motion, max_speed_mps=np.float64(2.0))])
