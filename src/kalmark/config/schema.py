@@ -249,7 +249,8 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
         if "bias_ax_mps2" not in has:
             raise unexpected_value(f"false: {motion.type} has no inertial unit", "start", "at_rest")
         if not np.all(start.sigma_bias_a_mps2):
-            raise unexpected_value("a positive number: at rest a bias is taken for a tilt", "start", "sigma_bias_a_mps2")
+            what = "a positive number: at rest a bias is taken for a tilt"
+            raise unexpected_value(what, "start", "sigma_bias_a_mps2")
     states = *STATES["plane"], *STATES["space"]
     for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
