@@ -5,7 +5,8 @@
 Without an option the counts are printed, with the files and the calls of functions, compiled ones included, that a
 control and a scan of a robot that moves enter.  `--check` compares them with the table of docs/architecture.md and
 exits with 1 if one is above its limit, or so far below that the limit has to follow; `--write` lowers the limits.  A
-limit is raised by hand, with its reason in the same line.  `--missing` lists the public functions whose docstring
+limit is raised by hand, with its reason in the same line: one above that of an earlier version, as git has it, is
+refused where the reason is still the same.  `--missing` lists the public functions whose docstring
 states no shape: one that takes or returns an array (by its annotations; mappings of named arrays excepted) has a
 docstring with a shape, such as (K, 3) or (n,).
 """
@@ -32,6 +33,7 @@ ROOT = Path(__file__).parent.parent
 SOURCES = ROOT / "src" / "kalmark"
 LIMITS = ROOT / "docs" / "architecture.md"
 ROW = re.compile(r"^\| (?P<name>[^|]+?) \| (?P<limit>\d+) \|(?P<why>[^|]*)\|$", re.MULTILINE)
+VERSIONS = 20  # of the limits, with which they are compared
 SLACK = 0.002  # of a limit, by which a count may be below it
 QUESTIONS = ("what", "which", "how", "where", "why", "when", "whether")
 FIGURATIVE = re.compile(
@@ -298,6 +300,31 @@ def against_limits(text: str, found: dict[str, int]) -> list[str]:
     return wrong
 
 
+def earlier_versions() -> list[str]:
+    """Return the latest texts of docs/architecture.md that git has, none where there is no git or no history."""
+
+    def git(*command: str) -> str:
+        try:
+            return subprocess.run(["git", *command], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        except (OSError, subprocess.CalledProcessError):
+            return ""
+
+    file = LIMITS.relative_to(ROOT)
+    commits = git("log", "--first-parent", f"-{VERSIONS}", "--format=%H", "--", str(file)).split()
+    return [git("show", f"{commit}:{file}") for commit in commits]
+
+
+def raised_without_reason(text: str, earlier: Iterable[str]) -> list[str]:
+    """Return a line for each limit of a text that is above that of an earlier one and has the same reason, or none."""
+    now, wrong = {row["name"]: row for row in ROW.finditer(text)}, {}
+    for old in (row for version in earlier for row in ROW.finditer(version)):
+        new = now.get(old["name"], old)
+        if int(new["limit"]) > int(old["limit"]) and new["why"].strip() in ("", old["why"].strip()):
+            limits = f"{old['limit']} to {new['limit']}"
+            wrong[old["name"]] = f"{old['name']}: the limit rose from {limits}, expected a reason of its own"
+    return [*wrong.values()]
+
+
 def lowered(text: str, found: dict[str, int]) -> str:
     """Return the text of docs/architecture.md with the limits that are above their counts lowered to these."""
 
@@ -324,7 +351,9 @@ def main() -> int:
     if given.write:
         LIMITS.write_text(lowered(LIMITS.read_text(), found))
     if given.check:
-        print(*(wrong := against_limits(LIMITS.read_text(), found)), sep="\n")
+        text, earlier = LIMITS.read_text(), earlier_versions()
+        wrong = against_limits(text, found) + raised_without_reason(text, earlier)
+        print(*wrong, *(() if earlier else ["git has no earlier limits: none are compared with them"]), sep="\n")
         return 1 if wrong else 0
     print(*(f"{name}: {number}" for name, number in found.items()), sep="\n")
     return 0

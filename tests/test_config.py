@@ -305,9 +305,11 @@ def test_a_start_of_space_may_have_a_sigma_for_each_axis(tmp_path: Path) -> None
     start = load_config(path).robots["each"].start
     assert start is not None
     assert start.sigma_rotation_deg == (1, 2, 0)  # type: ignore[union-attr]
-    for bad in ("[1, 2]", "-1", "[1, -2, 3]", "no", "[1, .inf, 3]"):
+    least, finite = "a number of at least 0", "a finite number"
+    wanted = {"[1, 2]": least, "-1": least, "[1, -2, 3]": least, "no": "a number", "[1, .inf, 3]": finite}
+    for bad, what in wanted.items():
         message = refusal(path, f"robots.each.start.sigma_rotation_deg={bad}")
-        assert message.endswith("expected a number >= 0, or a list of three: one for each axis")
+        assert message.endswith(f"expected {what}, or a list of three: one for each axis")
 
 
 def test_every_option_of_a_log_format_is_a_key_with_its_line_of_documentation() -> None:

@@ -120,7 +120,7 @@ def test_points_become_euclidean_below_the_linearity_index_of_the_map(
     config = load_config(path, [] if value is None else [f"map.reparametrize={value}"])
     assert build_slam(config).state.settings.reparametrize == linearity
     for bad in ("-1", "true", "on", ".inf"):
-        with pytest.raises(ConfigError, match="expected a number > 0, or off"):
+        with pytest.raises(ConfigError, match="expected a number of at least 0 or off"):
             load_config(path, [f"map.reparametrize={bad}"])
 
 

@@ -6,7 +6,7 @@ import ast
 from collections import Counter
 
 import pytest
-from structure import against_limits, branches, docstrings, lowered, of_module, of_node
+from structure import against_limits, branches, docstrings, lowered, of_module, of_node, raised_without_reason
 
 LIMITS = "| a | 3 | of old |\n| b | 1000 | |\n"
 
@@ -24,6 +24,21 @@ def test_a_count_is_held_by_its_limit() -> None:
     assert against_limits(LIMITS, {"a": 3, "b": 900})[0].endswith("lower the limit by --write")
     assert against_limits(LIMITS, {"a": 3})[0].startswith("b: 0, at most 1000: lower"), "a count of nothing is 0"
     assert lowered(LIMITS, {"a": 4, "b": 900}) == "| a | 3 | of old |\n| b | 900 | |\n"
+
+
+def test_a_limit_is_raised_with_a_reason_of_its_own_alone() -> None:
+    def row(limit: int, why: str) -> str:
+        return f"| a | {limit} | {why}|\n"
+
+    before = [row(4, "of old "), row(3, "of old "), row(9, "older ")]
+    assert raised_without_reason(row(5, "a race track "), before) == []
+    assert raised_without_reason(row(3, "of old "), before) == []
+    assert raised_without_reason(row(5, "of old "), before) == [
+        "a: the limit rose from 3 to 5, expected a reason of its own"
+    ]
+    assert raised_without_reason(row(4, "of old "), before), "it was lower meanwhile"
+    assert raised_without_reason(row(5, ""), before)
+    assert raised_without_reason(row(5, ""), []) == []
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform,
 import numpy as np
 
 from kalmark.errors import KalmarkError, ModelError, PluginError
-from kalmark.events import MOST, bound, largest_magnitude, short_text
+from kalmark.events import bound, largest_magnitude, short_text
 from kalmark.geometry.spaces import Space
 from kalmark.plugins import load_all
 
@@ -86,9 +86,12 @@ class Within:
             return False
         return all(vars(operator)[name](value, limit) for name, limit in self.limits.items())
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
-        """Return how pydantic validates a number of a section: within, and no larger than a distance may be."""
-        return handler(source) | {"ge": -MOST["m"], "le": MOST["m"]} | self.limits
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Return how pydantic validates a number of a section: as a parameter of a model that has its name."""
+        from pydantic_core import core_schema
+
+        own = Parameter(handler.field_name or "", source, None, False, (), self, "")
+        return core_schema.no_info_plain_validator_function(lambda value: source(own.validated(value)))
 
     def words(self, kind: str) -> str:
         """Return what is expected: `kind` is "number" or "whole number"."""
@@ -206,7 +209,7 @@ class Parameter:
                     if largest_magnitude(self.name)[0] < abs(number) < math.inf
                     else ""
                 )
-            return self.wanted if math.isfinite(number) or self.within.infinite else "a finite number"
+            return self.wanted if math.isfinite(number) or self.within.infinite or self.words else "a finite number"
         if get_origin(self.type) is tuple:
             kind, *more = get_args(self.type)
             size = None if more == [...] else 1 + len(more)
@@ -219,6 +222,17 @@ class Parameter:
         if self.values is not None:
             return "" if isinstance(value, Mapping) else self.wanted
         return self.wanted if self.type is None else ""
+
+    def validated(self, value: Any) -> Any:
+        """Return a value as a section of a configuration has it.  Raises the error of pydantic."""
+        from pydantic_core import PydanticCustomError
+
+        wanted = self.refused(value)
+        if wanted and self.type is None:
+            raise PydanticCustomError("literal_error", "another word", {"expected": str(self.words)})
+        if wanted:
+            raise PydanticCustomError("expected", "{what}", {"what": wanted})
+        return tuple(value) if isinstance(value, list) else value
 
 
 def unit_of(name: str) -> str:
@@ -291,11 +305,17 @@ def refuse(model: Any, key: str, wanted: str, what: str | None = None) -> ModelE
 
 
 def check_parameters(model: Any, what: str | None = None) -> None:
-    """Refuse a model, `what` in the message, with a parameter that is not as declared.  Raises ModelError."""
+    """Refuse a model, `what` in the message, with a parameter that is not as declared.  Raises ModelError.
+
+    Numbers of NumPy become Python's: a float32 would be squared in float32, and read from a file it is none.
+    """
     for parameter in parameters(type(model)):
-        wanted = parameter.refused(vars(model)[parameter.name])
+        value = vars(model)[parameter.name]
+        wanted = parameter.refused(value)
         if wanted:
             raise refuse(model, parameter.name, wanted, what)
+        if isinstance(value, np.generic):
+            object.__setattr__(model, parameter.name, value.item())
 
 
 def summary(model: type) -> str:

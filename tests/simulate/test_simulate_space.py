@@ -228,7 +228,7 @@ def test_a_log_of_space_is_written_and_read_back(tmp_path: Path) -> None:
         ("robots.robot.sensing={laser: {every: 2}}", "expected sensing of lidar, not of 'laser'"),
         (
             "robots.robot.sensing={lidar: {outliers: 2}}",
-            "robots.robot.sensing.lidar.outliers: got 2, expected a number <= 1",
+            "robots.robot.sensing.lidar.outliers: got 2, expected a number of at least 0 up to 1",
         ),
         ("robots.rover={motion: {type: unicycle}, route: {type: wander}}", "all move in the plane, or all in space"),
         ("world={type: random_box, min_m: [1, 0, 0], max_m: [0, 1, 1]}", "expected max_m nowhere below min_m"),

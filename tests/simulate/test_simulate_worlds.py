@@ -205,8 +205,8 @@ def test_laying_over_replaces_a_section_of_another_type() -> None:
     ("change", "said"),
     [
         (("steps: 5", "stepz: 5"), r"mine.yaml:7:1: stepz: .*did you mean steps"),
-        (("steps: 5", "steps: 0"), r"mine.yaml:7:8: steps: got 0, expected a number >= 1"),
-        (("steps: 5", "dt_s: -1"), r"mine.yaml:7:7: dt_s: got -1, expected a number > 0"),
+        (("steps: 5", "steps: 0"), r"mine.yaml:7:8: steps: got 0, expected a whole number of at least 1"),
+        (("steps: 5", "dt_s: -1"), r"mine.yaml:7:7: dt_s: got -1, expected a positive number"),
         (("steps: 5", "dt_s: .nan"), r"mine.yaml:7:7: dt_s: got nan, expected"),
         (("type: list", "type: lists"), r"mine.yaml:1:15: world.type: got 'lists', expected one of .*mean list"),
         (("type: list, ", ""), r"mine.yaml:1:8: world: got .* expected a mapping with a type: one of cloister"),

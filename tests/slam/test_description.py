@@ -341,6 +341,58 @@ def test_a_run_notes_what_its_configuration_lacks(tmp_path: Path) -> None:
         load_config(tmp_path / "run" / "config.yaml")
 
 
+class Ring:
+    """Range to a circle about a beacon, a class that keeps its numbers by itself."""
+
+    columns, angular = ("range_m",), (False,)
+
+    def __init__(self, radius_m: float) -> None:
+        self.radius_m = radius_m
+
+    def expect(self, v: Any) -> Any:
+        r = np.linalg.norm(v, axis=1)
+        return r[:, None] - self.radius_m, (v / r[:, None])[:, None]
+
+    def noise(self, y: Any) -> Any:
+        return np.ones((len(y), 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "name", "lacking"),
+    [
+        (
+            km.pointwise(lambda v: v, np.eye(2)),
+            "s",
+            "pointwise.py:PointwiseSensor: `kalmark run` requires a registered",
+        ),
+        (km.factor(lambda a, b: a - b, np.eye(2)), "s", "blocks.py:BlockSensor: `kalmark run` requires a registered"),
+        (Ring(0.5), "s", f"{Path(__file__).name}:Ring: `kalmark run` requires a registered class in a file"),
+        (SENSORS[0], "each", "a robot or a sensor called each, which stands for all of them there"),
+    ],
+)
+def test_a_run_notes_a_sensor_that_its_configuration_cannot_have(sensor: Any, name: str, lacking: str) -> None:
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle(), sensors={name: km.Mount(sensor)})])
+    run = km.record(slam, [km.Control(t_s=0.0, robot="r", u=(0.5, 0.1))], progress=False)
+    assert run.notes[1:] and run.notes[1].startswith(f"config.yaml cannot have {lacking}")
+
+
+@pytest.mark.parametrize("value", [0.0, None])
+def test_a_linearity_index_of_zero_or_none_is_read_again(value: float | None, tmp_path: Path) -> None:
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle())], reparametrize=value)
+    for again in read_again(slam, tmp_path):
+        assert_same(again, slam)
+
+
+def test_numbers_of_numpy_are_those_that_a_configuration_has(tmp_path: Path) -> None:
+    motion = km.motion.Unicycle(sigma_v_mps=np.float32(0.3))  # squared as a float32 it is another variance
+    slam = km.Slam([km.Robot("r", motion, max_speed_mps=np.float64(2.0))])
+    for again in read_again(slam, tmp_path):
+        assert_same(again, slam)
+        np.testing.assert_array_equal(
+            again.robots["r"].motion.control_noise(np.ones(2)), motion.control_noise(np.ones(2))
+        )
+
+
 def test_a_detector_of_what_its_sensor_does_not_measure_is_refused() -> None:
     said = r"Mount: detector is a Walls, expected one for the bearing_rad of a Bearing"
     with pytest.raises(ModelError, match=said):

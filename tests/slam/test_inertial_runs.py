@@ -267,7 +267,7 @@ def test_a_start_at_rest_is_found_in_the_log_and_is_consistent() -> None:
 @pytest.mark.parametrize(
     ("start", "what"),
     [
-        ("{at_rest: true, sigma_bias_a_mps2: 0.0}", "sigma_bias_a_mps2: got 0.0, expected a number > 0"),
+        ("{at_rest: true, sigma_bias_a_mps2: 0.0}", "sigma_bias_a_mps2: got 0.0, expected a positive number"),
         ("{at_rest: 1}", "at_rest: got 1, expected true or false"),
     ],
 )

@@ -24,7 +24,6 @@ from kalmark.arrays import Array, Flags, block_diagonal
 from kalmark.errors import DivergedError
 from kalmark.events import Id, Scan
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.rotations import conjugate, exp, log, multiply
 from kalmark.geometry.spaces import POINT2, POINT3
 from kalmark.models.landmarks import Polar2D
 from kalmark.models.protocols import Pointed, Segmented, place_of
@@ -79,24 +78,12 @@ def state_error(mean: Array, truth: Array, turn: Any, coordinates: str) -> Array
     In space that is a velocity in the world and numbers of the robot's frame, (13,) or (16,), or a gravity in the world
     behind them, (19,).  In the plane all of it, up to (6,), is in the robot's frame.
     """
-    if len(mean) < 7:
-        place, angle = point_error(mean[:2], truth[:2], turn, coordinates), wrap(truth[2] - mean[2])
-        return np.concatenate([place, [angle], truth[3:] - mean[3:]])
-    parts = [point_error(mean[:3], truth[:3], turn, coordinates), orientation_error(mean, truth, turn, coordinates)]
-    if len(mean) > 7:
-        parts += [point_error(mean[7:10], truth[7:10], turn, coordinates), truth[10:16] - mean[10:16]]
-    if len(mean) > 16:
-        parts.append(point_error(mean[16:], truth[16:], turn, coordinates))
-    return np.concatenate(parts)
-
-
-def orientation_error(mean: Array, truth: Array, turn: Array, coordinates: str) -> Array:
-    """Return the error (3,) of a pose's orientation: after the turn about the observing robot's, what is its own."""
-    if coordinates == "world":
-        return rotation_error(mean[3:7], truth[3:7])
-    back = conjugate(exp(np.ascontiguousarray(turn)))
-    own: Array = log(multiply(back, multiply(truth[3:7].copy(), conjugate(mean[3:7].copy()))))
-    return own + turn
+    pose = 3 if len(mean) < 7 else 7
+    behind = truth[pose:] - mean[pose:]
+    for at in range(0, len(behind), 9) if pose == 7 else ():  # vectors in the world
+        vector = slice(at, at + 3)
+        behind[vector] = point_error(mean[7:][vector], truth[7:][vector], turn, coordinates)
+    return np.concatenate([pose_error(mean[:pose], truth[:pose], coordinates, turn), behind])
 
 
 def robot_turn(mean: Array, truth: Array) -> Any:

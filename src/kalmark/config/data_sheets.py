@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from kalmark.config.tree import KeyPath, Plain, Tree, folder_beside, quote_value
-from kalmark.declare import class_of, classes, parameters
+from kalmark.declare import Parameter, class_of, classes, parameters
 from kalmark.errors import ConfigError, LogError
-from kalmark.events import is_number, largest_magnitude
 from kalmark.logs.source import read_mapping
 from kalmark.plugins import entry_points_of, load
 
@@ -31,19 +30,16 @@ def data_sheet(path: str | Path) -> dict[str, float]:
         raise ConfigError(str(error)) from None
     below = content.get("imu0")
     content = below if isinstance(below, dict) else content
-    return {_parameter(name): _density(path, name, content.get(name)) for name in NAMES}
+    for name in NAMES:
+        if wanted := _parameter(name).refused(value := content.get(name)):
+            raise ConfigError(f"{path}: {name}: got {quote_value(value)}, expected {wanted}")
+    return {_parameter(name).name: float(content[name]) for name in NAMES}
 
 
-def _parameter(name: str) -> str:
+def _parameter(name: str) -> Parameter:
     """Return the parameter of the motion, which has its unit at its end."""
     motion = class_of("motion", "inertial")
-    return next(own.name for own in parameters(motion) if own.name.startswith(f"{name}_"))
-
-
-def _density(path: Path, name: str, value: Any) -> float:
-    if not is_number(value) or not 0 <= value <= largest_magnitude(name)[0]:
-        raise ConfigError(f"{path}: {name}: got {quote_value(value)}, expected a number >= 0")
-    return float(value)
+    return next(own for own in parameters(motion) if own.name.startswith(f"{name}_"))
 
 
 def take_data_sheets(tree: Tree, path: Path | None) -> None:
@@ -73,7 +69,7 @@ def has_parameter(role: str, kind: Any, name: str) -> bool:
 
 def _take_motion(tree: Tree, path: Path | None, where: KeyPath, section: Plain) -> None:
     """Put the numbers of the `preset` of a motion, and those of its `data_sheet`, in their places."""
-    if not has_parameter("motion", section.get("type"), _parameter(NAMES[0])):
+    if not has_parameter("motion", section.get("type"), _parameter(NAMES[0]).name):
         return
     if "preset" in section:
         _take_preset(tree, where, section)

@@ -189,9 +189,6 @@ def _at(values: Any, path: KeyPath) -> Any:
 def _expected(kind: str, context: dict[str, Any], message: str) -> str:
     if kind == "expected":
         return str(context["what"])
-    for name, sign in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<")):
-        if name in context:
-            return f"a number {sign} {context[name]:g}"
     return _EXPECTED.get(kind, message[0].lower() + message[1:])
 
 

@@ -14,7 +14,6 @@ from kalmark.config.sections import (
     BASES,
     Choice,
     LandmarkId,
-    Linearity,
     ModelSection,
     RobotName,
     Section,
@@ -250,7 +249,8 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
         if "bias_ax_mps2" not in has:
             raise unexpected_value(f"false: {motion.type} has no inertial unit", "start", "at_rest")
         if not np.all(start.sigma_bias_a_mps2):
-            raise unexpected_value("a number > 0: at rest a bias is taken for a tilt", "start", "sigma_bias_a_mps2")
+            what = "a positive number: at rest a bias is taken for a tilt"
+            raise unexpected_value(what, "start", "sigma_bias_a_mps2")
     states = *STATES["plane"], *STATES["space"]
     for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
         if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
@@ -354,8 +354,7 @@ TRUTH = "truth"  # what stands for a file with the true landmarks
 
 SETTINGS = {each.name: each for each in declared_options(Settings)}
 OF_MAP: Any = options_section(
-    [replace(SETTINGS["map"], name="type"), SETTINGS["numbers"], SETTINGS["reparametrize"]],
-    kinds={"reparametrize": Linearity},
+    [replace(SETTINGS["map"], name="type"), SETTINGS["numbers"], replace(SETTINGS["reparametrize"], words=("off",))]
 )
 
 

@@ -5,18 +5,18 @@ The sections of models are made from their declarations.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, PlainValidator, create_model, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, create_model, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from kalmark.declare import (
     Parameter,
+    Within,
     classes,
     classes_of,
     has_one_model,
@@ -28,12 +28,11 @@ from kalmark.declare import (
     world_of_class,
 )
 from kalmark.errors import EventError, ModelError
-from kalmark.events import MOST, Id, checked_id, is_number
+from kalmark.events import Id, checked_id
 from kalmark.plugins import entry_points_of, load
 from kalmark.slam.description import model_described
 from kalmark.slam.sources import finds
 
-FAR = MOST["m"]
 USUAL = {
     "landmark": "point", "association": "identity", "estimator": "invariant", "initialization": "immediate"
 }  # fmt: skip
@@ -70,26 +69,16 @@ def unexpected_value(what: str, *below: str) -> PydanticCustomError:
     return PydanticCustomError("expected", "{what}", {"what": what, "below": below})
 
 
-def _sigmas(value: Any) -> float | tuple[float, ...]:
+def _sigmas(value: Any, info: ValidationInfo) -> float | tuple[float, ...]:
     three = value if isinstance(value, list | tuple) else [value] * 3
-    if len(three) == 3 and all(is_number(v) and 0 <= v <= FAR for v in three):
-        return tuple(map(float, three)) if isinstance(value, list | tuple) else float(value)
-    far = f" and <= {FAR:.0e}" if any(is_number(v) and FAR < v < math.inf for v in three) else ""
-    raise unexpected_value(f"a number >= 0{far}, or a list of three: one for each axis")
+    own = Parameter(info.field_name or "", float, None, False, (), Within(ge=0), "")
+    wanted = next(filter(None, map(own.refused, three)), "" if len(three) == 3 else own.wanted)
+    if wanted:
+        raise unexpected_value(f"{wanted}, or a list of three: one for each axis")
+    return tuple(map(float, three)) if isinstance(value, list | tuple) else float(value)
 
 
 Sigmas = Annotated[float | tuple[float, ...], PlainValidator(_sigmas)]
-
-
-def _linearity(value: Any) -> float | str:
-    if value == "off":
-        return "off"
-    if is_number(value) and 0 < value < math.inf:
-        return float(value)
-    raise unexpected_value("a number > 0, or off")
-
-
-Linearity = Annotated[float | str, PlainValidator(_linearity)]
 
 
 def _robot(value: Any) -> int | str:
@@ -249,9 +238,7 @@ def options_section(
     """
     fields: dict[str, Any] = {}
     for each in declared:
-        default = defaults.get(each.name, each.default)
-        number: Any = Annotated[float, each.within]
-        kind = number if each.type is float else annotation(replace(each, optional=False))
+        default, kind = defaults.get(each.name, each.default), annotation(replace(each, optional=False))
         kind = (kinds or {}).get(each.name, kind if default is not None else kind | None)
         default = section_of(each.role, default)() if each.role and default is not None else default
         fields[each.name] = kind, Field(default=default, description=each.text)
@@ -267,16 +254,7 @@ def annotation(parameter: Parameter) -> Any:
         role = parameter.values.role
         kind = dict[str, Annotated[Any, Choice(role)] if role else str]  # type: ignore[misc, valid-type]
         return kind | None if parameter.optional else kind
-
-    def validated(value: Any) -> Any:
-        wanted = parameter.refused(value)
-        if wanted and parameter.type is None:
-            raise PydanticCustomError("literal_error", "another word", {"expected": str(parameter.words)})
-        if wanted:
-            raise unexpected_value(wanted)
-        return tuple(value) if isinstance(value, list) else value
-
-    return Annotated[Any, PlainValidator(validated)]
+    return Annotated[Any, PlainValidator(parameter.validated)]
 
 
 def model_of(section: Any, world: str = "plane") -> Any:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import is_dataclass
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.declare import declared_options, is_own, own_name, plugin_of
+from kalmark.config.tree import EACH
+from kalmark.declare import declared_options, is_own, own_name, plugin_of, registered_name
 from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
@@ -57,8 +59,17 @@ def not_described(slam: Slam, log: Log) -> Iterator[str]:
     if slam.t_ns is not None:
         yield "config.yaml lacks the events that the filter had before this log: `kalmark run` makes another map"
     for kind in _own(slam):
-        if not is_own(kind) and (isinstance(kind, FunctionType) or plugin_of(kind) is None):
+        if not _is_made_by_name(kind):
             yield f"config.yaml cannot have {own_name(kind)}: `kalmark run` requires a registered class in a file"
+    if EACH in (name for robot in slam.robots.values() for name in (robot.name, *robot.sensors)):
+        yield f"config.yaml cannot have a robot or a sensor called {EACH}, which stands for all of them there"
+
+
+def _is_made_by_name(kind: Any) -> bool:
+    """Return whether a class or function has a name in a configuration, which then has all its parameters, too."""
+    if is_own(kind) or isinstance(kind, FunctionType):
+        return registered_name(kind) is not None
+    return plugin_of(kind) is not None and (is_dataclass(kind) or "__init__" not in vars(kind))
 
 
 def _own(slam: Slam) -> list[Any]:

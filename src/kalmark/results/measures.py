@@ -19,7 +19,7 @@ from kalmark.compiled import compiled
 from kalmark.filter import kernels
 from kalmark.geometry.angles import exponential_v, wrap
 from kalmark.geometry.gaussian import quantile
-from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inverse, log, multiply
+from kalmark.geometry.rotations import conjugate, exp, from_matrix, left_jacobian_inverse, log, multiply
 from kalmark.results.history import History, Ints
 
 SINGULAR = 1e-12  # 1 / tr C^-1, at most the smallest eigenvalue of a correlation matrix C, up to which it is singular
@@ -216,19 +216,20 @@ def point_error(mean: Array, truth: Array, dtheta: Any, coordinates: str) -> Arr
     return np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0]], axis=-1)
 
 
-def pose_error(mean: Array, truth: Array, coordinates: str = "world") -> Array:
+def pose_error(mean: Array, truth: Array, coordinates: str = "world", turn: Any = None) -> Array:
     """Return the errors (..., 3 or 6) of poses (..., 3 or 7): position, then orientation, in "world" or "log".
 
     In log coordinates the estimate's retraction by the error is the truth: the orientation turned by Exp(d_theta), the
-    position moved by V(d_theta) d_p.
+    position moved by V(d_theta) d_p.  `turn` is the error of the orientation of the robot that observed the pose, its
+    own if absent: then the orientation's is that turn, and of what is left its logarithm.
     """
     mean, truth = np.asarray(mean, dtype=np.float64), np.asarray(truth, dtype=np.float64)
-    if mean.shape[-1] == 7:
-        turn = rotation_error(mean[..., 3:], truth[..., 3:])
-        return np.concatenate([point_error(mean[..., :3], truth[..., :3], turn, coordinates), turn], axis=-1)
-    dtheta = np.asarray(wrap(truth[..., 2] - mean[..., 2]))
-    position = point_error(mean[..., :2], truth[..., :2], dtheta, coordinates)
-    return np.concatenate([position, dtheta[..., None]], axis=-1)
+    d = 3 if mean.shape[-1] == 7 else 2
+    own = rotation_error(mean[..., 3:], truth[..., 3:]) if d == 3 else np.asarray(wrap(truth[..., 2] - mean[..., 2]))
+    position = point_error(mean[..., :d], truth[..., :d], own if turn is None else turn, coordinates)
+    if d == 3 and turn is not None and coordinates == "log":
+        own = turn + log(multiply(conjugate(exp(turn)), exp(own)))
+    return np.concatenate([position, own if d == 3 else own[..., None]], axis=-1)
 
 
 @compiled

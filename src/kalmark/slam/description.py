@@ -183,7 +183,7 @@ def model_described(role: str, said: Mapping[str, Any], world: str = "") -> Any:
     given = {each.name: said[each.name] for each in own if each.optional or said[each.name] is not None}
     try:
         return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in given.items()})
-    except TypeError as error:
+    except (AttributeError, TypeError) as error:
         raise ModelError(f"{name} cannot be made of the keys of its section: {error}") from None
 
 

@@ -484,23 +484,23 @@ class Slam(Estimate):
 
         Its state stays as it is: twins of it take made-up events, as `kalmark.slam.warm_up_events` has them.
         """
-        from kalmark.slam.warm_up_events import rehearse, warm_up_detectors, without_detectors
+        from kalmark.slam.warm_up_events import process_made_up_events, warm_up_detectors, without_detectors
 
         warm_up_detectors(self.robots.values())
         robots, settings = without_detectors(self.robots.values()), self.state.settings
         kinds = ("dense", "postponed") if self.state.may_grow else (settings.map,)
         for kind in kinds:
             twin = Slam(robots, **vars(settings) | {"map": kind})
-            surveyed = rehearse(twin, twin.process, twin.add_landmark)
+            surveyed = process_made_up_events(twin, twin.process, twin.add_landmark)
             if any(policy.restarts for policy in self.state.policies.values()):  # and once with rays that stay
                 twin = Slam(robots, **vars(settings) | {"map": kind})
                 twin.state.policies = {k: replace(of, restarts=False) for k, of in twin.state.policies.items()}
-                rehearse(twin, twin.process, twin.add_landmark)
+                process_made_up_events(twin, twin.process, twin.add_landmark)
         if self.tracks.known:
             twin = Slam(robots, **vars(settings) | {"map": kinds[0]})
             for name, mean, model in surveyed:
                 twin.add_landmark(name, mean, None, model)
-            rehearse(twin, twin.process, twin.add_landmark)
+            process_made_up_events(twin, twin.process, twin.add_landmark)
 
     # ------------------------------------------------------------------ files
     def save(self, path: str | Path) -> None:

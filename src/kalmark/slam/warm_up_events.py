@@ -68,7 +68,7 @@ def warm_up_detectors(robots: Iterable[Robot]) -> None:
                 mount.detector.warm_up()
 
 
-def rehearse(
+def process_made_up_events(
     twin: Estimate, process: Callable[[Event], object], add: Callable[..., None]
 ) -> list[tuple[Id, Array, Landmark]]:
     """Let a twin of a Slam take made-up events by `process`, and use all that they lead to; `add` adds landmarks.
@@ -81,7 +81,7 @@ def rehearse(
         return twin.map.mean(slot) if channel is None else channel.pose(twin.map, slot)
 
     kernels.are_covariances(np.eye(1)[None], 0.0)  # as of an event with noise of its own
-    for k, event in enumerate(rehearsal(twin.robots.values(), pose)):
+    for k, event in enumerate(made_up_events(twin.robots.values(), pose)):
         with suppress(Exception):  # it only tries; what is wrong shows when it is done in earnest
             process(event)
         if k % INTERVAL == INTERVAL - 1 and isinstance(twin.map, CompressedMap):
@@ -155,13 +155,13 @@ def _merge(twin: Estimate) -> None:
                 make_equal(twin.state, channel, twin.state.moving[robot].slot, [(mine[0], mine[1])])
 
 
-def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
+def made_up_events(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
     """Yield events of each robot and sensor: a few landmarks seen again and again, with ids and without, and a fix.
 
     `pose` gives where a robot's sensor, both by name, is at the time of the call, (3,) or (7,).
     """
     robots, t_s = list(robots), 0.0
-    mounts = rehearsed_mounts(robots)
+    mounts = mounts_to_warm_up(robots)
     readings = {key: _reading(m.sensor, len(m.at)) for key, m in mounts.items() if isinstance(m.sensor, OfState)}
     scenes = {key: _Scene(mount, pose(*key)) for key, mount in mounts.items() if key not in readings}
     for k in range(ROUNDS):
@@ -182,7 +182,7 @@ def rehearsal(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Ite
                 yield Fix(t_s, robot.name, np.asarray(robot.start)[:size], np.eye(size))
 
 
-def rehearsed_mounts(robots: Iterable[Robot]) -> dict[ChannelKey, Mount]:
+def mounts_to_warm_up(robots: Iterable[Robot]) -> dict[ChannelKey, Mount]:
     """Return the mounts of robots by their names, but those of sensors of blocks, which compile nothing."""
     every = {(robot.name, name): mount for robot in robots for name, mount in robot.sensors.items()}
     return {key: mount for key, mount in every.items() if not measures_blocks(mount.sensor)}
