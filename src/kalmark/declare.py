@@ -532,12 +532,22 @@ def plugin_of(model: Any) -> Path | None:
 
 
 def class_of_file(name: str) -> type | None:
-    """Return the class that a plugin has of the name file.py:Class, None if none has it."""
+    """Return the class that a plugin has of the name file.py:NAME, None if none has it.
+
+    Of an object of that name, such as a sensor of `km.pointwise`, it is a class that makes this object.
+    """
     place, _, attribute = name.rpartition(":")
     for file, module in _PLUGINS.items():
-        if place in (file.stem, file.name, str(file)) and isinstance(model := vars(module).get(attribute), type):
-            return model
+        if place in (file.stem, file.name, str(file)) and (model := vars(module).get(attribute)) is not None:
+            return model if isinstance(model, type) else type(attribute, (), {"__new__": lambda cls: model})
     return None
+
+
+def place_of_object(value: Any) -> tuple[Path, str] | None:
+    """Return the user's file that has a class or another object, and the name it has there; None if none has it."""
+    homes = ((_file_of(module, ".py"), module) for module in [*sys.modules.values()])
+    named = ((file, home, name) for file, home in homes if file for name, own in vars(home).items() if own is value)
+    return next(((file, name) for file, home, name in named if home.__name__.partition(".")[0] != "kalmark"), None)
 
 
 def line_of_error(error: BaseException) -> str:

@@ -6,8 +6,10 @@ The options are those that are declared: fields of `Robot`, `Mount` and `Setting
 from __future__ import annotations
 
 import itertools
+import sys
 from collections.abc import Iterator
 from dataclasses import fields, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
@@ -321,11 +323,10 @@ def test_a_robot_without_events_is_in_the_run_again_in_its_place(tmp_path: Path)
     assert_same_state(km.record(*run_again(tmp_path / "run"), progress=False, pictures=False).slam, slam)
 
 
-def find(scan: km.Scan) -> km.Scan:
-    return scan
-
-
 def test_a_run_notes_what_its_configuration_lacks(tmp_path: Path) -> None:
+    def find(scan: km.Scan) -> km.Scan:
+        return scan
+
     rover = km.Robot("r", km.motion.Unicycle(), sensors={"s": km.Mount(SENSORS[0], detector=find)})
     slam, events = km.Slam([rover]), [km.Control(t_s=0.1 * k, robot="r", u=(0.5, 0.1)) for k in range(4)]
     slam.process(events[0])
@@ -333,28 +334,13 @@ def test_a_run_notes_what_its_configuration_lacks(tmp_path: Path) -> None:
     assert run.notes == [
         "config.yaml has no log, because this one has no file: `kalmark run` of it requires --log",
         "config.yaml lacks the events that the filter had before this log: `kalmark run` makes another map",
-        f"config.yaml cannot have {Path(__file__).name}:find: `kalmark run` requires a registered class in a file",
+        f"config.yaml cannot have {Path(__file__).name}:{find.__qualname__}: "
+        "`kalmark run` requires a registered class, or an object, of a file",
     ]
     run.save(tmp_path / "run")
     assert km.Run.load(tmp_path / "run").evaluate()["notes"][:3] == run.notes
-    with pytest.raises(ConfigError, match=r"detector\.type: got '.*:find', expected one of"):
+    with pytest.raises(ConfigError, match=r"detector\.type: got '.*lacks.*, expected one of"):
         load_config(tmp_path / "run" / "config.yaml")
-
-
-class Ring:
-    """Range to a circle about a beacon, a class that keeps its numbers by itself."""
-
-    columns, angular = ("range_m",), (False,)
-
-    def __init__(self, radius_m: float) -> None:
-        self.radius_m = radius_m
-
-    def expect(self, v: Any) -> Any:
-        r = np.linalg.norm(v, axis=1)
-        return r[:, None] - self.radius_m, (v / r[:, None])[:, None]
-
-    def noise(self, y: Any) -> Any:
-        return np.ones((len(y), 1, 1))
 
 
 @pytest.mark.parametrize(
@@ -366,7 +352,6 @@ class Ring:
             "pointwise.py:PointwiseSensor: `kalmark run` requires a registered",
         ),
         (km.factor(lambda a, b: a - b, np.eye(2)), "s", "blocks.py:BlockSensor: `kalmark run` requires a registered"),
-        (Ring(0.5), "s", f"{Path(__file__).name}:Ring: `kalmark run` requires a registered class in a file"),
         (SENSORS[0], "each", "a robot or a sensor called each, which stands for all of them there"),
     ],
 )
@@ -381,6 +366,43 @@ def test_a_linearity_index_of_zero_or_none_is_read_again(value: float | None, tm
     slam = km.Slam([km.Robot("r", km.motion.Unicycle())], reparametrize=value)
     for again in read_again(slam, tmp_path):
         assert_same(again, slam)
+
+
+FUNCTIONS = """
+import numpy as np
+import kalmark as km
+
+def place(y):
+    return [y[0] * np.cos(y[1]), y[0] * np.sin(y[1])]
+
+sonar = km.pointwise(
+    lambda v: [np.hypot(*v), np.arctan2(v[1], v[0])], [[0.01, 0.001], [0.001, 0.004]], inverse=place,
+    columns=("range_m", "bearing_rad"), angular=(False, True),
+)
+tape = km.factor(lambda a, b: np.linalg.norm(a - b), [[0.01]], columns=("distance_m",))
+"""
+
+
+def test_sensors_of_functions_in_a_file_are_the_same_from_the_folder_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_functions.py").write_text(FUNCTIONS)
+    monkeypatch.syspath_prepend(tmp_path)
+    mine: Any = import_module("my_functions")
+    sensors = {"s": km.Mount(mine.sonar), "tape": km.Mount(mine.tape)}
+    slam = km.Slam([km.Robot("r", km.motion.Unicycle(), sensors=sensors)])
+    write_log(tmp_path / "log", {"r": ["s"]}, {"s": mine.sonar.columns})
+    run = km.record(slam, km.open_log(tmp_path / "log"), progress=False, pictures=False)
+    assert run.notes == [] and run.config["plugins"] == [str(tmp_path / "my_functions.py")]
+    assert run.config["robots"]["r"]["sensors"]["s"]["type"] == "my_functions.py:sonar"
+    run.save(tmp_path / "run")
+    again, log = run_again(tmp_path / "run")
+    assert {name: mount.sensor for name, mount in again.robots["r"].sensors.items()} == {
+        "s": mine.sonar, "tape": mine.tape
+    }  # fmt: skip
+    assert_same_state(km.record(again, log, progress=False, pictures=False).slam, slam)
+    assert len(slam.landmarks()) == len(PLACES)
+    del sys.modules["my_functions"]
 
 
 def test_numbers_of_numpy_are_those_that_a_configuration_has(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from kalmark.files import replace_folder, write
 from kalmark.geometry.gaussian import quantile
 from kalmark.results.evaluate import none_for_nan
 from kalmark.results.figure_texts import Figures
+from kalmark.results.measures import finite_mean
 from kalmark.results.scene import COLOURS, group_steps
 
 POINTS = 400  # of a curve, at most
@@ -69,29 +70,23 @@ class Anees:
         self.mean = np.where(known, np.where(finite, values, 0.0).sum(axis=0) / divisor, np.nan)
         self.low = np.where(known, quantile(tail, dof) / divisor, np.nan)
         self.high = np.where(known, quantile(1.0 - tail, dof) / divisor, np.nan)
-        self.ideal = 1.0 if kind == "joint" else mean(size[finite])
+        self.ideal = 1.0 if kind == "joint" else finite_mean(size[finite])
 
     @property
     def average(self) -> float:
         """The average over robots and steps."""
-        return mean(self.mean[:, self.skip :])
+        return finite_mean(self.mean[:, self.skip :])
 
     @property
     def inside(self) -> float:
         """The share of steps inside the band."""
         inside = np.where(np.isfinite(self.mean), (self.low <= self.mean) & (self.mean <= self.high), np.nan)
-        return mean(inside[:, self.skip :])
-
-
-def mean(values: Array) -> float:
-    """Return the mean of the values (N,) that are finite, NaN if none is."""
-    values = values[np.isfinite(values)]
-    return float(values.mean()) if len(values) else float("nan")
+        return finite_mean(inside[:, self.skip :])
 
 
 def rms(values: Any) -> float:
     """Return the root mean square of the values (N,) that are finite."""
-    return mean(np.asarray(values) ** 2) ** 0.5
+    return finite_mean(np.asarray(values) ** 2) ** 0.5
 
 
 def figures(scores: Sequence[Scores], skip: int = 0) -> Figures:
@@ -112,7 +107,7 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> Figures:
             result[f"{name}_anees{suffix}"] = anees.average
             result[f"{name}_inside{suffix}"] = anees.inside
     pose = np.array([s.series["pose"] for s in scores])
-    each = np.array([mean(nees[:, skip:]) for nees in pose])
+    each = np.array([finite_mean(nees[:, skip:]) for nees in pose])
     each = each[np.isfinite(each)]
     result["pose_anees_sigma"] = float(np.std(each, ddof=1)) / len(each) ** 0.5 if len(each) > 1 else float("nan")
     pose = pose[np.isfinite(pose)]
@@ -121,7 +116,7 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> Figures:
     result["heading_rmse_deg"] = float(np.degrees(rms([s.series["heading_rad"] for s in scores])))
     result["landmark_rmse_m"] = rms([s.landmark_rmse_m for s in scores])
     result["landmark_rmse_raw_m"] = rms([s.landmark_rmse_raw_m for s in scores])
-    result["landmarks"] = mean(np.array([float(s.landmarks) for s in scores]))
+    result["landmarks"] = finite_mean([s.landmarks for s in scores])
     dof = sum(s.nis_dof for s in scores)
     result["nis_per_dof"] = sum(s.nis for s in scores) / dof if dof else float("nan")
     return result | mount_uncertainties(scores)

@@ -31,6 +31,7 @@ from kalmark.report import Report
 from kalmark.results.measures import (
     MAP_NEES,
     aligned_rmse,
+    finite_mean,
     has_diverged,
     map_nees,
     nees,
@@ -107,7 +108,7 @@ def judge_landmark(
         return None
     own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
     if isinstance(model, Polar2D):  # its Gaussian is on an arc: so is its error
-        return BlockError(_unrolled(mean, own), _unrolled(mean, world), F, point[None], truth[None])
+        own, world = (_unrolled(mean, error) for error in (own, world))
     return BlockError(own, world, F, point[None], truth[None])
 
 
@@ -304,8 +305,7 @@ class _Scorer:
             at = np.flatnonzero(self.uncertain[name].open)
             values.append(nees(d[at], self.slam.covariance(name)[np.ix_(at, at)]))
             dof.append(len(at))
-        if np.isfinite(values).any():
-            series["mount"][row, k], series["mount_dof"][row, k] = np.nanmean(values), np.mean(dof)
+        series["mount"][row, k], series["mount_dof"][row, k] = finite_mean(values), np.mean(dof)
         parts = np.array([[np.linalg.norm(d[: self.d]), np.linalg.norm(d[self.d :])] for d in errors.values()])
         series["mount_m"][row, k], series["mount_rad"][row, k] = parts.max(axis=0)
 
@@ -338,7 +338,7 @@ def scores_of(
     d = 2 if mean.shape[-1] == 3 else 3
     own, world = (pose_error(mean, truth, c) for c in (coordinates, "world"))
     series["pose"] = nees(own, P)
-    series["pose_world"] = series["pose"].copy() if coordinates == "world" else nees(world, P)
+    series["pose_world"] = nees(world, P)
     series["heading"] = nees(world[..., d:], P[..., d:, d:])
     for name, size in (("pose", own.shape[-1]), ("heading", own.shape[-1] - d)):
         series[f"{name}_dof"] = np.where(np.isfinite(series[name]), float(size), np.nan)

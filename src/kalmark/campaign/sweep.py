@@ -14,13 +14,14 @@ import numpy as np
 from scipy.special import stdtrit
 
 from kalmark.arrays import Array
-from kalmark.campaign.campaign import FIGURES, Campaign, kinds, largest_last_value, mean, rms
+from kalmark.campaign.campaign import FIGURES, Campaign, kinds, largest_last_value, rms
 from kalmark.campaign.campaign import FILES as RESULTS
 from kalmark.campaign.scoring import Scores
 from kalmark.campaign.sweep_cells import Cell, value_as_yaml
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.figure_texts import Figures
+from kalmark.results.measures import finite_mean
 from kalmark.results.run_page import figure_text, html_table, read_page, tagged
 from kalmark.results.scene import COLOURS
 
@@ -38,7 +39,7 @@ def run_figures(score: Scores, names: list[str], skip: int) -> Figures:
     row: Figures = {"diverged": score.diverged, "stopped": score.stopped}
     for name in names:
         over = series["joint_dof"] if name == "joint" else 1.0
-        row[f"{name}_nees"] = mean((series[name] / over)[:, skip:])
+        row[f"{name}_nees"] = finite_mean((series[name] / over)[:, skip:])
     row["position_rmse_m"] = rms(series["position_m"])
     row["heading_rmse_deg"] = float(np.degrees(rms(series["heading_rad"])))
     row |= {"landmark_rmse_m": score.landmark_rmse_m, "landmark_rmse_raw_m": score.landmark_rmse_raw_m}

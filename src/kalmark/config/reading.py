@@ -22,10 +22,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 ENDINGS = (".yaml", ".yml")
 _EXPECTED = {
-    "float_type": "a number",
-    "finite_number": "a finite number",
     "int_type": "a whole number",
-    "int_from_float": "a whole number",
     "string_type": "text",
     "bool_type": "true or false",
     "tuple_type": "a list",

@@ -15,6 +15,7 @@ from kalmark.config.sections import (
     Choice,
     LandmarkId,
     ModelSection,
+    Numbers,
     RobotName,
     Section,
     Sigmas,
@@ -40,8 +41,6 @@ from kalmark.slam.state import Settings
 Picture = Annotated[Any, Choice(registered_name(PictureOptions) or "")]  # it is registered by its import
 
 Plugins = Annotated[KeyPath, Field(strict=False)]
-Numbers = Annotated[tuple[Annotated[float, Field(allow_inf_nan=False)], ...], Field(strict=False)]
-
 Covariance = Annotated[tuple[Numbers, ...], Field(strict=False)]
 
 _SPACE_FOR_PLANE = "a key of space for a robot of the plane"

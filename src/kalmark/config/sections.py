@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInf
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from kalmark.declare import (
+    Number,
     Parameter,
     Within,
     classes,
@@ -70,12 +71,13 @@ def unexpected_value(what: str, *below: str) -> PydanticCustomError:
 
 
 def _sigmas(value: Any, info: ValidationInfo) -> float | tuple[float, ...]:
-    three = value if isinstance(value, list | tuple) else [value] * 3
+    several = isinstance(value, list | tuple)
+    three = value if several else [value] * 3
     own = Parameter(info.field_name or "", float, None, False, (), Within(ge=0), "")
     wanted = next(filter(None, map(own.refused, three)), "" if len(three) == 3 else own.wanted)
     if wanted:
         raise unexpected_value(f"{wanted}, or a list of three: one for each axis")
-    return tuple(map(float, three)) if isinstance(value, list | tuple) else float(value)
+    return tuple(map(float, three)) if several else float(value)
 
 
 Sigmas = Annotated[float | tuple[float, ...], PlainValidator(_sigmas)]
@@ -98,6 +100,8 @@ def _id(value: Any) -> Id:
 
 
 LandmarkId = Annotated[Id, PlainValidator(_id)]
+
+Numbers = Annotated[tuple[Number, ...], Field(strict=False)]
 
 BASES: dict[tuple[str, str], type[Section]] = {}  # by role and world: what all sections of that choice have
 

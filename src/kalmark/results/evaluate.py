@@ -22,6 +22,7 @@ from kalmark.results.measures import (
     Rigid,
     aligned_rmse,
     associated_nis,
+    finite_mean,
     has_diverged,
     identity_alignment,
     nees,
@@ -129,7 +130,7 @@ def headline(run: Recording) -> tuple[str, list[str]]:
     errors = [figures for figures in summary["robots"].values() if figures.get("ate_m") is not None]
 
     def mean_of(key: str) -> float:
-        return _mean(np.array([f[key] for f in errors if f.get(key) is not None]))
+        return finite_mean([f[key] for f in errors if f.get(key) is not None])
 
     if errors:
         parts.append(f"position {figure(mean_of('ate_raw_m'))} m ({figure(mean_of('ate_m'))} m aligned)")
@@ -188,9 +189,9 @@ def pose_figures(mean: Array, P: Array, truth: Array, coordinates: str = "world"
         "ate_m": aligned_rmse(mean[:, :d], truth[:, :d]),
         "ate_raw_m": rmse(world[:, :d]),
         "heading_rmse_deg": float(np.degrees(rmse(world[:, d:]))),
-        "pose_nees": _mean(nees(own, P)),
+        "pose_nees": finite_mean(nees(own, P)),
         "pose_nees_most": nees_limit(own, P),
-        "pose_nees_world": _mean(nees(world, P)),
+        "pose_nees_world": finite_mean(nees(world, P)),
         "path_m": path_m(truth[:, :d]),
         "diverged": has_diverged(own, world, P, truth),
     }
@@ -348,7 +349,7 @@ def fix_figures(distance: Array) -> Figures:
     return {
         "fix_median_m": _quantile(distance, 0.5),
         "fix_rms_10m": rmse(near[:, None]),
-        "fix_within_10m": len(near) / len(distance) if len(distance) else float("nan"),
+        "fix_within_10m": finite_mean(distance <= FIX_NEAR_M),
         "fixes_compared": len(distance),
     }
 
@@ -370,7 +371,3 @@ def none_for_nan(value: Any) -> Any:
 
 def _quantile(values: Array, q: float) -> float:
     return float(np.quantile(values, q)) if len(values) else float("nan")
-
-
-def _mean(values: Array) -> float:
-    return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

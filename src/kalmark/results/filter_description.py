@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import is_dataclass
+from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.config.tree import EACH
-from kalmark.declare import declared_options, is_own, own_name, plugin_of, registered_name
+from kalmark.declare import declared_options, is_own, own_name, place_of_object, plugin_of, registered_name
 from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
@@ -41,13 +41,13 @@ def configuration(slam: Slam, log: Log) -> dict[str, Any]:
 
     Before the first event of the Slam it has what was added to its map.
     """
-    own, of_log = _own(slam), dict[str, Any]()
+    files, of_log = {file for _, file in _own(slam)}, dict[str, Any]()
     if log.path is not None:
         of_log = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
-        own += [entry.read] if (entry := known_formats().get(log.format)) else []
+        files |= {plugin_of(entry.read)} if (entry := known_formats().get(log.format)) else set()
     if silent := [name for name in slam.robots if name not in log.robots]:
         of_log["without_events"] = silent
-    plugins = sorted({str(file) for each in own if (file := plugin_of(each)) is not None})
+    plugins = sorted(map(str, files - {None}))
     said = ({"plugins": plugins} if plugins else {}) | ({"log": of_log} if of_log else {})
     return said | (describe(slam) if slam.t_ns is not None else describe_beginning(slam))
 
@@ -58,29 +58,31 @@ def not_described(slam: Slam, log: Log) -> Iterator[str]:
         yield "config.yaml has no log, because this one has no file: `kalmark run` of it requires --log"
     if slam.t_ns is not None:
         yield "config.yaml lacks the events that the filter had before this log: `kalmark run` makes another map"
-    for kind in _own(slam):
-        if not _is_made_by_name(kind):
-            yield f"config.yaml cannot have {own_name(kind)}: `kalmark run` requires a registered class in a file"
-    if EACH in (name for robot in slam.robots.values() for name in (robot.name, *robot.sensors)):
+    for kind, file in _own(slam):
+        if file is None and not (is_own(kind) and registered_name(kind)):
+            what = "a registered class, or an object, of a file"
+            yield f"config.yaml cannot have {own_name(kind)}: `kalmark run` requires {what}"
+    if EACH in {*slam.robots}.union(*mounts_of(slam.robots)):
         yield f"config.yaml cannot have a robot or a sensor called {EACH}, which stands for all of them there"
 
 
-def _is_made_by_name(kind: Any) -> bool:
-    """Return whether a class or function has a name in a configuration, which then has all its parameters, too."""
-    if is_own(kind) or isinstance(kind, FunctionType):
-        return registered_name(kind) is not None
-    return plugin_of(kind) is not None and (is_dataclass(kind) or "__init__" not in vars(kind))
-
-
-def _own(slam: Slam) -> list[Any]:
-    """Return the classes, or functions, of the models of a Slam."""
+def _own(slam: Slam) -> list[tuple[Any, Path | None]]:
+    """Return the classes, or functions, of the models of a Slam, with the users' files that have them or the models."""
     mounts = mounts_of(slam.robots).values()
     parts = (slam.state.settings, *slam.robots.values(), *mounts)
     models = [vars(part)[own.name] for part in parts for own in declared_options(type(part))]
     models += [mount.sensor for mount in mounts]
     models += [slam.landmark_model(name) for name in (*slam.tracks.confirmed, *slam.tracks.known)]
     models = [each for each in models if not isinstance(each, bool | int | float | str | np.generic | None)]
-    return [*dict.fromkeys(each if isinstance(each, FunctionType) else type(each) for each in models)]
+    return [*dict.fromkeys(map(_home, models))]
+
+
+def _home(model: Any) -> tuple[Any, Path | None]:
+    kind: Any = model if isinstance(model, FunctionType) else type(model)
+    if registered_name(kind):
+        return kind, plugin_of(kind)
+    place = place_of_object(model) or place_of_object(kind)
+    return kind, place and place[0]
 
 
 @runtime_checkable

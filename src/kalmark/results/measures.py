@@ -127,6 +127,12 @@ def rmse(errors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else float("nan")
 
 
+def finite_mean(values: Any) -> float:
+    """Return the mean of the values (N, ...) that are finite, NaN if none is."""
+    values = np.asarray(values)[np.isfinite(values)]
+    return float(values.mean()) if len(values) else float("nan")
+
+
 def aligned_rmse(estimate: Array, truth: Array) -> float:
     """Return the RMSE of positions (N, d) after the rigid alignment that makes it least."""
     return rmse(rigid(estimate, truth)(estimate) - truth)
@@ -224,12 +230,15 @@ def pose_error(mean: Array, truth: Array, coordinates: str = "world", turn: Any 
     own if absent: then the orientation's is that turn, and of what is left its logarithm.
     """
     mean, truth = np.asarray(mean, dtype=np.float64), np.asarray(truth, dtype=np.float64)
-    d = 3 if mean.shape[-1] == 7 else 2
-    own = rotation_error(mean[..., 3:], truth[..., 3:]) if d == 3 else np.asarray(wrap(truth[..., 2] - mean[..., 2]))
-    position = point_error(mean[..., :d], truth[..., :d], own if turn is None else turn, coordinates)
-    if d == 3 and turn is not None and coordinates == "log":
+    if mean.shape[-1] == 3:
+        own = np.asarray(wrap(truth[..., 2] - mean[..., 2]))
+        position = point_error(mean[..., :2], truth[..., :2], own if turn is None else turn, coordinates)
+        return np.concatenate([position, own[..., None]], axis=-1)
+    own = rotation_error(mean[..., 3:], truth[..., 3:])
+    position = point_error(mean[..., :3], truth[..., :3], own if turn is None else turn, coordinates)
+    if turn is not None and coordinates == "log":
         own = turn + log(multiply(conjugate(exp(turn)), exp(own)))
-    return np.concatenate([position, own if d == 3 else own[..., None]], axis=-1)
+    return np.concatenate([position, own], axis=-1)
 
 
 @compiled

@@ -18,7 +18,7 @@ from numpy.random import Generator
 from pydantic import AfterValidator, Field, model_validator
 
 from kalmark.arrays import Array, Index
-from kalmark.config.sections import OneOf, Section, unexpected_value
+from kalmark.config.sections import Numbers, OneOf, Section, unexpected_value
 from kalmark.declare import Count, NotNegative, Number, Positive, Within
 from kalmark.events import Raw
 from kalmark.geometry.frames3d import from_euler_pose
@@ -40,8 +40,7 @@ def _some(points: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...
     return points
 
 
-Point = Annotated[tuple[Number, ...], Field(strict=False)]
-Points = Annotated[tuple[Point, ...], Field(strict=False), AfterValidator(_some)]
+Points = Annotated[tuple[Numbers, ...], Field(strict=False), AfterValidator(_some)]
 
 
 def closed(points: tuple[tuple[float, ...], ...], *below: str) -> tuple[tuple[float, ...], ...]:

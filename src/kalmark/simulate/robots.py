@@ -23,7 +23,7 @@ from kalmark.detect.laser_scan import RAW, Laser
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event, Id, Raw, Scan, list_names, seconds_text, sort_key
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.spaces import SE2, SE3
+from kalmark.geometry.spaces import SE3, mount_space
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.source import landmark_id
 from kalmark.models.observe import sensor_pose
@@ -260,7 +260,7 @@ def draw_mount(mount: Mount, rng: Generator) -> tuple[Any, Array]:
     sensor: Any = mount.sensor
     at = np.array(mount.at)
     if mount.cov is not None:
-        at = (SE2 if len(at) == 3 else SE3).plus(at, gaussian(mount.cov, rng))
+        at = mount_space(len(at)).plus(at, gaussian(mount.cov, rng))
     cov = parameter_covariance(sensor)
     if cov is None:
         return sensor, at

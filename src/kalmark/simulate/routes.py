@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.random import Generator
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from kalmark.arrays import Array
 from kalmark.compiled import address_of, by_address, compiled, python_form, signature_of
-from kalmark.config.sections import OneOf, Section
-from kalmark.declare import NotNegative, Number, Positive
+from kalmark.config.sections import Numbers, OneOf, Section
+from kalmark.declare import NotNegative, Positive
 from kalmark.geometry.angles import rotation, wrap
 from kalmark.geometry.frames import compose
 from kalmark.geometry.rotations import left_jacobian, matrix
@@ -61,7 +61,7 @@ class Constant(Section):
     """The same control at every step: a circle or a line, with stops if these take any time."""
 
     type: Literal["constant"] = "constant"
-    u: Annotated[tuple[Number, ...], Field(strict=False)]
+    u: Numbers
     """The control, in the motion model's columns."""
     drive_s: Positive = 10.0
     """Time between stops."""

@@ -29,6 +29,7 @@ from kalmark.declare import (
     has_one_model,
     own_name,
     parameters,
+    place_of_object,
     registered_name,
 )
 from kalmark.errors import KalmarkError, ModelError
@@ -109,8 +110,13 @@ def plain_value(value: Any) -> Any:
 
 
 def describe_model(value: Any) -> Description:
-    """Return the type and the parameters of a model; a class or function without a name is file.py:Class."""
+    """Return the type and the parameters of a model.
+
+    That of a user's without a name is file.py:NAME, of an object in his file or of a class there.
+    """
     kind: Any = value if isinstance(value, FunctionType) else type(value)
+    if registered_name(kind) is None and (place := place_of_object(value)):
+        return {"type": f"{place[0].name}:{place[1]}"}
     name = registered_name(kind) or own_name(kind)
     given = {own.name: plain_value(vars(value)[own.name]) for own in parameters(type(value))}
     return given if has_one_model(name) else {"type": name} | given
