@@ -46,6 +46,20 @@ def test_a_place_that_was_mapped_twice_is_found_with_its_shift_and_turn(share: f
     assert repeat.sure
 
 
+def test_a_map_is_searched_again_for_repeats_of_its_new_landmarks_only() -> None:
+    rng, slam = np.random.default_rng(1), empty()
+    places, others = rng.uniform(0, 20, (2, 30, 2))
+    for shift in (0.0, 40.0):
+        part(slam, places + shift, rng)
+    twice = slam.tracks.changes
+    for shift in ((0.0, 60.0), (40.0, -60.0)):
+        part(slam, others + np.array(shift), rng)
+    assert len(found(slam)) == 2
+    (repeat,) = find_repeats(slam.map, slam.tracks, twice)
+    assert {name for pair in repeat.pairs for name in pair} <= {*list(slam.tracks.confirmed)[60:]}
+    assert find_repeats(slam.map, slam.tracks, slam.tracks.changes) == []
+
+
 def test_a_mirrored_place_is_another_one() -> None:
     rng, slam = np.random.default_rng(1), empty()
     places = rng.uniform(0, 20, (30, 2))
@@ -166,15 +180,15 @@ def test_a_displaced_part_is_as_uncertain_as_it_was_off_and_keeps_its_shape() ->
     (repeat,) = find_repeats(slam.map, slam.tracks)
     assert sorted(repeat.newer) == sorted(newer)
     slots = [slam.slot(name) for name in newer]
-    moved = displacement(slam.map, slots, repeat)
+    means, F, Q = displacement(slam.map, slots, repeat)
     back = np.array([slam.mean(name) for name in older])
-    np.testing.assert_allclose(np.array(moved.means), back, atol=0.3)
-    P = moved.F @ slam.covariance(*newer) @ moved.F.T + moved.Q
-    middle = int(np.argmin(np.linalg.norm(np.array(moved.means) - places.mean(axis=0), axis=1)))
+    np.testing.assert_allclose(np.array(means), back, atol=0.3)
+    P = F @ slam.covariance(*newer) @ F.T + Q
+    middle = int(np.argmin(np.linalg.norm(np.array(means) - places.mean(axis=0), axis=1)))
     sigma = np.sqrt(P[2 * middle, 2 * middle])
     assert sigma == pytest.approx(np.linalg.norm(repeat.shift), rel=0.2)
     a, b = 0, 1
-    apart = np.array(moved.means)[a] - np.array(moved.means)[b]
+    apart = np.array(means)[a] - np.array(means)[b]
     J = np.hstack([apart, -apart]) / np.linalg.norm(apart)
     both = np.r_[2 * a : 2 * a + 2, 2 * b : 2 * b + 2]
     assert J @ P[np.ix_(both, both)] @ J == pytest.approx(2 * SIGMA_M**2), "a rigid motion changes no distance"

@@ -15,61 +15,61 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index, block_diagonal
-from kalmark.association.ratio import log_ratios
 from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.geometry.angles import rotation
-from kalmark.geometry.frames import from_frame
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR
+from kalmark.management.constellations import (
+    NEAREST,
+    Places,
+    Transform,
+    agreement_with_itself,
+    count_agreeing,
+    extended,
+    fit,
+    hull,
+    matched,
+    sides,
+)
 from kalmark.management.merge import EQUAL_M, GATE
 from kalmark.report import Repeat
 from kalmark.tracks.track import Tracks
 
-NEAREST = 6  # landmarks seen together with one, of which triangles are made
-AROUND = 16  # landmarks seen together with a corner of a triangle, by which a hypothesis is judged at first
 ALIKE = 8  # triangles that one is compared with
-MOST_TRIANGLES, MOST_MATCHES, TRIES = 60_000, 8_000, 24
+TRIES = 24  # constellations
 JUDGED = 6  # constellations, the largest
 FEWEST = 5  # pairs
 SIGMAS = 4.0  # by which landmarks that agree may miss, and
 SLACK = 0.04  # of the spacing of landmarks, for errors that are not in the covariance
-LOOSE = 0.25  # of the spacing, above which a landmark is not paired
-ROUNDS = 12
 FALSE_ALARMS = 1e-3  # expected of a map without repeats
-SAMPLE, MOVES = 40, 600  # landmarks of a part, and transforms, by which it is compared with itself
+SAMPLE = 40  # landmarks of a part that is compared with itself
 WEIGHED = 40  # pairs that are weighed together
 SURE = 1e-9  # expected of a map without repeats, below which a repeat is accepted
 FITS = 0.9999  # of right shapes pass
-GROWN, GROWN_BY = 5, 0.2  # landmarks that have come or gone, or so many of all, until a map is searched again
+GROWN = 5  # landmarks that have come or gone until a map is searched again
 TURNED_RAD = 0.1  # a sigma of the turn that is allowed for at least
 IN_A_REPEAT = "in a repeat"  # ends the reason of a merge
 CLEAR = 0.2  # from a half, the share of the last scan's landmarks that decides in which part a robot is
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
 
 
-def find_repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
-    """Return the repeats in a map of points in the plane, the surest first.  O(n log n)."""
-    look = _RepeatCandidates.of(map_, tracks)
+def find_repeats(map_: Map, tracks: Tracks, since: int = 0) -> list[Repeat]:
+    """Return the repeats in a map of points in the plane, the surest first.  O(n log n).
+
+    Only those are searched that have landmarks which entered the map after so many changes of it.
+    """
+    look = _RepeatCandidates.of(map_, tracks, since)
     if look is None:
         return []
-    found: list[tuple[_Constellation, Repeat]] = []
-    tried: list[_Constellation] = []
-    for T, seeds in _hypotheses(look):
-        if any(each.holds(seeds) for each in tried):
-            continue
-        grown = _grown(look, T, seeds)
-        tried.append(grown)
-        if len(tried) == TRIES:
-            break
-    tried.sort(key=lambda each: each.missing - len(each.pairs))
-    judged = 0
+    found, judged = list[tuple[_Constellation, Repeat]](), 0
+    tried = _constellations(look)
     for each in tried:
         if judged == JUDGED or len(each.pairs) < FEWEST or any(each.overlaps(other) for other, _ in found):
             continue
@@ -81,61 +81,45 @@ def find_repeats(map_: Map, tracks: Tracks) -> list[Repeat]:
 
 @dataclass(frozen=True, eq=False)
 class _RepeatCandidates:
-    """Landmarks (N,) that may be repeated: names, slots, places (N, 2), the `codes` a N + b of those seen in one scan.
+    """Landmarks (N,) that may be repeated: their names, slots and `places`, and `near` (N, 6) those seen with each.
 
-    `given` (N,) have an id of the log.  `near` are the landmarks seen with each, the nearest first.  `tolerance` [m] is
-    by how much two that are one may miss, `spacing` [m] the distance to the nearest.
+    Where fewer were seen with one the rest is -1.  `new` (N,) are those of which repeats are searched.
     """
 
     map: Map
     names: list[Id]
     slots: Index
-    places: Array
-    codes: Index
-    given: Flags
-    near: list[Index]
-    spacing: float
-    tolerance: float
-    tree: Any
+    places: Places
+    near: Index
+    new: Flags
 
     @classmethod
-    def of(cls, map_: Map, tracks: Tracks) -> _RepeatCandidates | None:
-        from scipy.spatial import cKDTree
-
+    def of(cls, map_: Map, tracks: Tracks, since: int) -> _RepeatCandidates | None:
         points = [track for track in tracks.confirmed.values() if len(track.covisible) > 2 and _is_point(track)]
         kinds = Counter(track.model.kind for track in points)
-        names = [track.id for track in points if track.model.kind == kinds.most_common(1)[0][0]]
-        if len(names) < 2 * FEWEST or not any(map(tracks.is_invented, names)):
+        kind = max(kinds, key=lambda each: kinds[each], default="")
+        points = [track for track in points if track.model.kind == kind]
+        names = [track.id for track in points]
+        at, given = {name: i for i, name in enumerate(names)}, np.array([not tracks.is_invented(n) for n in names])
+        together = [[at[other] for other in track.covisible if other in at and other != track.id] for track in points]
+        counts = np.array([len(row) for row in together])
+        some = np.flatnonzero(counts)
+        if len(some) < 2 * FEWEST or given.all():
             return None
-        slots, at = tracks.slots_of(names), {name: i for i, name in enumerate(names)}
-        places, near, codes = map_.means(slots, 2), [], []
-        given = np.array([not tracks.is_invented(name) for name in names])
-        for i, name in enumerate(names):
-            seen = np.array([at[n] for n in tracks.confirmed[name].covisible if n in at and n != name], dtype=np.int64)
-            far = np.linalg.norm(places[seen] - places[i], axis=1)
-            near.append(seen[np.argsort(far, kind="stable")])
-            codes += [i * len(names) + seen, np.array([i * len(names) + i])]
-        nearest = [float(np.linalg.norm(places[n[0]] - places[i])) for i, n in enumerate(near) if len(n)]
-        if len(nearest) < 2 * FEWEST:
-            return None
-        spacing, sigma = float(np.median(nearest)), _relative_sigma(map_, slots, near)
-        tolerance = SIGMAS * math.sqrt(2.0) * sigma + SLACK * spacing
-        tree, together = cKDTree(places), np.unique(np.concatenate(codes))
-        return cls(map_, names, slots, places, together, given, near, spacing, tolerance, tree)
-
-    def may_be(self, a: Index, b: Index) -> Flags:
-        """Return whether landmarks a and b may be one: they were not seen together and have not two ids."""
-        wanted = a * len(self.names) + b
-        at = np.minimum(np.searchsorted(self.codes, wanted), len(self.codes) - 1)
-        return np.asarray((self.codes[at] != wanted) & ~(self.given[a] & self.given[b]))
-
-    def covariance(self, rows: Index) -> Array:
-        """Return the joint covariance (2 K, 2 K) of the places of some landmarks."""
-        P = self.map.covariance([int(slot) for slot in self.slots[rows]])
-        sizes = [len(self.map.mean(int(slot))) for slot in self.slots[rows]]
-        starts = np.cumsum([0, *sizes[:-1]])
-        index = (starts[:, None] + np.arange(2)).ravel()
-        return P[np.ix_(index, index)]
+        slots, whose = tracks.slots_of(names), np.repeat(np.arange(len(names)), counts)
+        z = map_.means(slots, 2).view(np.complex128).ravel()
+        seen = np.fromiter(chain.from_iterable(together), np.int64)
+        far = np.abs(z[seen] - z[whose])
+        order = np.lexsort((seen, far, whose))
+        seen, first, by_x = seen[order], np.concatenate([[0], np.cumsum(counts)]), np.argsort(z.real, kind="stable")
+        ranks, spacing = np.arange(NEAREST), float(np.median(far[order][first[some]]))
+        near = np.where(ranks < counts[:, None], seen[np.minimum(first[:-1, None] + ranks, len(seen) - 1)], -1)
+        chosen = some[:: max(1, len(some) // SAMPLE)]
+        P = _of_differences(_joint_covariance(map_, slots[np.append(chosen, near[chosen, 0])]), np.eye(2))
+        sigma = math.sqrt(max(float(np.median(np.diag(P).reshape(-1, 2).mean(axis=1))), 0.0))  # relative to the nearest
+        tolerance = SIGMAS * sigma + SLACK * spacing
+        places = Places(z, z.real[by_x], by_x, first, seen, given, tolerance, spacing)
+        return cls(map_, names, slots, places, near, np.array([track.entered >= since for track in points]))
 
 
 def _is_point(track: Any) -> bool:
@@ -143,40 +127,64 @@ def _is_point(track: Any) -> bool:
     return bool(first == VECTOR and not {*others} - {SCALAR})
 
 
-def _relative_sigma(map_: Map, slots: Index, near: list[Index]) -> float:
-    """Return the median sigma [m] of landmarks relative to those seen with them."""
-    out, step = [], max(1, len(near) // 200)
-    for i in range(0, len(near), step):
-        if len(near[i]):
-            pair = [int(slots[i]), int(slots[near[i][0]])]
-            P, n = map_.covariance(pair), len(map_.mean(pair[0]))
-            D = P[:2, :2] + P[n : n + 2, n : n + 2] - P[:2, n : n + 2] - P[n : n + 2, :2]
-            out.append(math.sqrt(max(float(np.trace(D)) / 2, 0.0)))
-    return float(np.median(out)) / math.sqrt(2.0)
+def _joint_covariance(map_: Map, slots: Index) -> Array:
+    """Return the joint covariance (2 K, 2 K) of the places of landmarks."""
+    P, sizes = map_.covariance(slots.tolist()), [len(map_.rows(slot)) for slot in slots.tolist()]
+    index = (np.cumsum([0, *sizes[:-1]])[:, None] + np.arange(2)).ravel()
+    return P[np.ix_(index, index)]
 
 
-# ---------------------------------------------------------------------- hypotheses
-def _hypotheses(look: _RepeatCandidates) -> list[tuple[Array, Index]]:
-    """Return transforms T (3,), each with the three pairs (3, 2) it is of; those first that fit most neighbours."""
+def _of_differences(P: Array, A: Array) -> Array:
+    """Return the covariance (2 K, 2 K) of q - A p, P (4 K, 4 K) being that of places p, then q."""
+    k = len(P) // 4
+    J = np.hstack([-np.kron(np.eye(k), A), np.eye(2 * k)])
+    return np.asarray(J @ P @ J.T)
+
+
+# ---------------------------------------------------------------------- constellations
+class _Constellation(NamedTuple):
+    """Pairs (K, 2) of landmarks that agree under T, and how many landmarks among them have no partner."""
+
+    T: Transform
+    pairs: Index
+    missing: int
+
+    def overlaps(self, other: _Constellation) -> bool:
+        """Return whether a third of the landmarks are those of another one."""
+        return 3 * len(np.intersect1d(self.pairs, other.pairs)) > 2 * min(len(self.pairs), len(other.pairs))
+
+    def differs(self, other: _Constellation) -> bool:
+        """Return whether another one pairs the same landmarks with others."""
+        mine, its = (np.sort(each.pairs, axis=1) @ [1 << 32, 1] for each in (self, other))
+        return 2 * len(np.intersect1d(mine, its)) < min(len(mine), len(its))
+
+
+def _constellations(look: _RepeatCandidates) -> list[_Constellation]:
+    """Return the constellations that the best hypotheses are extended to, the largest first."""
+    found, pairs = list[_Constellation](), _hypotheses(look)
+    while len(pairs) and len(found) < TRIES:
+        found.append(_Constellation(*extended(look.places, pairs[0])))
+        partner = np.full(len(look.names), -1)
+        partner[found[-1].pairs[:, 0]] = found[-1].pairs[:, 1]
+        a, b = pairs[1:, :, 0], pairs[1:, :, 1]
+        pairs = pairs[1:][((partner[a] != b) & (partner[b] != a)).any(axis=1)]
+    return sorted(found, key=lambda each: each.missing - len(each.pairs))
+
+
+def _hypotheses(look: _RepeatCandidates) -> Index:
+    """Return hypotheses, three pairs (M, 3, 2) each; those first that fit most neighbours."""
     from scipy.spatial import cKDTree
 
     triangles, shape = _triangles(look)
-    if len(triangles) < 2:
-        return []
-    reach = 2.0 * look.tolerance
-    gaps: Any = cKDTree(shape).query(shape, k=min(ALIKE + 1, len(shape)), distance_upper_bound=reach)
-    one = np.repeat(np.arange(len(shape)), gaps[1].shape[1])
+    reach, new = 2.0 * look.places.tolerance, look.new[triangles].any(axis=1)
+    gaps: Any = cKDTree(shape).query(shape[new], k=ALIKE + 1, distance_upper_bound=reach)
+    one = np.repeat(np.flatnonzero(new), gaps[1].shape[1])
     two, miss = gaps[1].ravel(), gaps[0].ravel()
-    keep = np.isfinite(miss) & (one < two)
-    one, two, miss = one[keep], two[keep], miss[keep]
-    pairs = np.stack([triangles[one], triangles[two]], axis=2)  # (M, 3, 2)
-    free = look.may_be(pairs[..., 0], pairs[..., 1]).all(axis=1)
-    order = np.flatnonzero(free)[np.argsort(miss[free], kind="stable")[:MOST_MATCHES]]
-    pairs = pairs[order]
-    T = _transforms(look.places[pairs[..., 0]], look.places[pairs[..., 1]])
-    counts = _agreeing_nearby(look, T, pairs)
+    keep = np.isfinite(miss) & ((one < two) | ~np.append(new, False)[two])
+    pairs = np.stack([triangles[one[keep]], triangles[two[keep]]], axis=2)
+    counts = count_agreeing(look.places, pairs)
     best = np.argsort(-counts, kind="stable")
-    return [(T[i], pairs[i]) for i in best[counts[best] >= FEWEST - 1].tolist()]
+    return pairs[best[counts[best] >= FEWEST - 1]]
 
 
 def _triangles(look: _RepeatCandidates) -> tuple[Index, Array]:
@@ -184,154 +192,20 @@ def _triangles(look: _RepeatCandidates) -> tuple[Index, Array]:
 
     The corners are ordered by the sides opposite to them.
     """
-    near = np.full((len(look.near), NEAREST), -1)
-    for i, mine in enumerate(look.near):
-        near[i, : len(mine)] = mine[:NEAREST]
-    two = np.array([*combinations(range(NEAREST), 2)])
-    first = np.broadcast_to(np.arange(len(near))[:, None, None], (len(near), len(two), 1))
-    corners = np.concatenate([first, near[:, two]], axis=2).reshape(-1, 3)
-    corners = np.unique(np.sort(corners[(corners >= 0).all(axis=1)], axis=1), axis=0)
-    corners = corners[:: max(1, -(-len(corners) // MOST_TRIANGLES))]
-    p = look.places[corners]
-    sides = np.linalg.norm(np.roll(p, -1, axis=1) - np.roll(p, -2, axis=1), axis=2)
+    n, z = len(look.names), look.places.z
+    near = look.near[:, np.array([*combinations(range(NEAREST), 2)])].reshape(-1, 2)
+    corners = np.sort(np.column_stack([np.repeat(np.arange(n), len(near) // n), near])[(near >= 0).all(axis=1)], axis=1)
+    codes = np.unique((corners[:, 0] * n + corners[:, 1]) * n + corners[:, 2])
+    corners = np.column_stack([codes // n**2, codes // n % n, codes % n])
+    p = z[corners]
+    sides = np.abs(p[:, [1, 2, 0]] - p[:, [2, 0, 1]])
     order = np.argsort(sides, axis=1)
     corners, sides = np.take_along_axis(corners, order, axis=1), np.take_along_axis(sides, order, axis=1)
-    p = look.places[corners]
-    u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    wide = np.abs(area) > 2.0 * look.tolerance * sides[:, 2]
-    mirrored = np.where(area > 0, 1e3, -1e3) * look.spacing
+    p = z[corners]
+    area = (np.conj(p[:, 1] - p[:, 0]) * (p[:, 2] - p[:, 0])).imag
+    wide = np.abs(area) > 2.0 * look.places.tolerance * sides[:, 2]
+    mirrored = np.where(area > 0, 1e3, -1e3) * look.places.spacing
     return corners[wide], np.column_stack([sides, mirrored])[wide]
-
-
-def _transforms(p: Array, q: Array) -> Array:
-    """Return the poses T (M, 3) with the least squares of q - T p; p and q are (M, K, 2)."""
-    a, b = p.mean(axis=1), q.mean(axis=1)
-    u, v = p - a[:, None], q - b[:, None]
-    turn = np.arctan2((u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]).sum(axis=1), (u * v).sum(axis=(1, 2)))
-    c, s = np.cos(turn), np.sin(turn)
-    x, y = b[:, 0] - c * a[:, 0] + s * a[:, 1], b[:, 1] - s * a[:, 0] - c * a[:, 1]
-    return np.column_stack([x, y, turn])
-
-
-def _moved(T: Array, p: Array) -> Array:
-    """Return points p (M, K, 2), or (K, 2) for all, moved by T (M, 3)."""
-    c, s = np.cos(T[:, 2])[:, None], np.sin(T[:, 2])[:, None]
-    x, y = p[..., 0], p[..., 1]
-    return np.stack([c * x - s * y + T[:, :1], s * x + c * y + T[:, 1:2]], axis=2)
-
-
-def _agreeing_nearby(look: _RepeatCandidates, T: Array, pairs: Index) -> Index:
-    """Return of each transform how many landmarks near its triangle it maps on others."""
-    if not len(T):
-        return np.zeros(0, dtype=np.int64)
-    width = min(AROUND, max(len(near) for near in look.near))
-    table = np.array([np.resize(near, width) if len(near) < width else near[:width] for near in look.near])
-    mine = table[pairs[:, 0, 0]]  # (M, AROUND), some twice where there are few
-    far, nearest = look.tree.query(_moved(T, look.places[mine]))
-    same = (far <= 2.0 * look.tolerance) & look.may_be(mine, nearest)
-    marked = np.sort(np.where(same, mine, -1), axis=1)
-    return np.asarray((np.diff(marked, axis=1, prepend=-1) > 0).sum(axis=1) + 1)
-
-
-# ---------------------------------------------------------------------- constellations
-@dataclass(frozen=True, eq=False)
-class _Constellation:
-    """Pairs (K, 2) of landmarks that agree under T, and how many landmarks among them have no partner."""
-
-    T: Array
-    pairs: Index
-    missing: int
-
-    def holds(self, pairs: Index) -> bool:
-        """Return whether other pairs are all among these, in either order."""
-        mine = {*map(tuple, self.pairs.tolist())}
-        return all((a, b) in mine or (b, a) in mine for a, b in pairs.tolist())
-
-    def overlaps(self, other: _Constellation) -> bool:
-        """Return whether a third of the landmarks are those of another one."""
-        mine, its = {*self.pairs.ravel().tolist()}, {*other.pairs.ravel().tolist()}
-        return 3 * len(mine & its) > min(len(mine), len(its))
-
-
-def _grown(look: _RepeatCandidates, T: Array, pairs: Index) -> _Constellation:
-    """Return a hypothesis with all pairs that agree with it.
-
-    A landmark is of the part with which it was seen more often.
-    """
-    before: set[tuple[int, int]] = set()
-    for _ in range(ROUNDS):
-        a, b = _agreeing(look, T, pairs)
-        free = look.may_be(a, b)
-        if free.sum() < 3:
-            break
-        pairs = np.column_stack([a[free], b[free]])
-        (T,) = _transforms(look.places[None, pairs[:, 0]], look.places[None, pairs[:, 1]])
-        now = {*map(tuple, pairs.tolist())}
-        if now == before:
-            break
-        before = now
-    return _Constellation(T, pairs, _missing(look, T, pairs) if len(pairs) >= FEWEST else 0)
-
-
-def _agreeing(look: _RepeatCandidates, T: Array, pairs: Index) -> tuple[Index, Index]:
-    """Return the landmarks of the part of the first of pairs, and those of the other part, on which T moves them."""
-    sides = _sides(look, pairs)
-    return _matched(look, T, pairs, sides > 0, sides < 0)
-
-
-def _matched(look: _RepeatCandidates, T: Array, pairs: Index, of: Flags, others: Flags) -> tuple[Index, Index]:
-    """Return the landmarks of some (N,) that T, of these pairs, moves onto others (N,), each the nearest of its own."""
-    middle = look.places[pairs[:, 0]].mean(axis=0)
-    spread = math.sqrt(float(((look.places[pairs[:, 0]] - middle) ** 2).sum()))
-    lever = np.linalg.norm(look.places - middle, axis=1) / max(spread, look.tolerance)
-    reach = look.tolerance * (1.0 + lever)
-    far, onto = look.tree.query(_moved(T[None], look.places)[0])
-    a = np.flatnonzero(of & others[onto] & (far <= reach) & (reach <= LOOSE * look.spacing + look.tolerance))
-    a = a[np.argsort(far[a], kind="stable")]
-    b, first = np.unique(onto[a], return_index=True)
-    return a[first], b
-
-
-def _sides(look: _RepeatCandidates, pairs: Index) -> Index:
-    """Return of each landmark with how many more of the first than of the second of pairs it was seen (N,)."""
-    votes = np.zeros(len(look.names), dtype=np.int64)
-    for column, vote in ((0, 1), (1, -1)):
-        for i in pairs[:, column].tolist():
-            votes[look.near[i]] += vote
-            votes[i] += vote
-    return votes
-
-
-def _missing(look: _RepeatCandidates, T: Array, pairs: Index) -> int:
-    """Return how many landmarks of either part have no partner and are among those that have."""
-    sides = _sides(look, pairs)
-    rest = np.ones(len(sides), dtype=np.bool_)
-    rest[pairs.ravel()] = False
-    hull = look.places[pairs[:, 1]]
-    alone = [_moved(T[None], look.places[rest & (sides > 0)])[0], look.places[rest & (sides < 0)]]
-    return int(_inside(hull, np.concatenate(alone)).sum())
-
-
-def _inside(hull: Array, p: Array) -> Flags:
-    """Return which points p (K, 2) are within the convex hull of others."""
-    from scipy.spatial import Delaunay, QhullError
-
-    if len(hull) < 3 or not len(p):
-        return np.zeros(len(p), dtype=np.bool_)
-    try:
-        return np.asarray(Delaunay(hull).find_simplex(p) >= 0)
-    except QhullError:  # they are on a line
-        return np.zeros(len(p), dtype=np.bool_)
-
-
-def _area(p: Array) -> float:
-    from scipy.spatial import ConvexHull, QhullError
-
-    try:
-        return float(ConvexHull(p).volume)  # of two dimensions: the area
-    except QhullError:
-        return 0.0
 
 
 # ---------------------------------------------------------------------- judgement
@@ -339,61 +213,57 @@ def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constell
     """Return the repeat that a constellation is, None if it may be chance."""
     from scipy.special import betainc
 
-    k, m = len(found.pairs), len(found.pairs) + found.missing
-    area = _area(look.places[found.pairs[:, 1]])
+    of, k, m = look.places, len(found.pairs), len(found.pairs) + found.missing
+    corners = hull(of, found.pairs[:, 1])
+    area = 0.5 * float((np.conj(np.roll(corners, 1)) * corners).imag.sum())
     if area <= 0.0:
         return None
-    density = m / area
-    edges, few = sum(min(len(near), NEAREST) for near in look.near) / 2, min(1.0, SAMPLE / m)
-
-    def false_alarms(chance: float) -> float:
-        return 2.0 * edges**2 * float(betainc(few * k - 2, few * (m - k) + 1, chance))
-
-    chance = min(density * math.pi * look.tolerance**2, 1.0)
-    if false_alarms(chance) > FALSE_ALARMS:
-        return None
-    p = false_alarms(max(chance, *(_self_similarity(look, part) for part in found.pairs.T)))
-    if p > FALSE_ALARMS:
-        return None
+    density, p = m / area, 0.0
+    edges, few = (look.near >= 0).sum() / 2, min(1.0, SAMPLE / m)
+    chance = min(density * math.pi * of.tolerance**2, 1.0)
+    for each in chain([chance], (_self_similarity(of, part) for part in found.pairs.T)):
+        p = max(p, 2.0 * float(edges**2 * betainc(few * k - 2, few * (m - k) + 1, each)))
+        if p > FALSE_ALARMS:
+            return None
     pairs = found.pairs
     if np.median(pairs[:, 0]) > np.median(pairs[:, 1]):  # the order of landmarks is that of their age
-        pairs = pairs[:, ::-1]
-    (T,) = _transforms(look.places[None, pairs[:, 0]], look.places[None, pairs[:, 1]])
-    back = np.linalg.norm(from_frame(T, look.places[pairs[:, 1]])[0] - look.places[pairs[:, 0]], axis=1)
-    if np.median(back) <= look.spacing / 2:  # each part is the other one turned: the world is symmetric
-        return None
+        pairs = np.ascontiguousarray(pairs[:, ::-1])
+    older, newer = of.z[pairs[:, 0]], of.z[pairs[:, 1]]
+    T = fit(older, newer)
+    if np.median(np.abs(T[0] * newer + T[1] - older)) <= of.spacing / 2:
+        return None  # each part is the other one turned: the world is symmetric
     score, fits, agrees = _weighed(look, T, pairs, density)
     score += MISSED * found.missing
     rivals = any(
-        other is not found and 2 * len(other.pairs) > k and other.overlaps(found) and _differ(found, other)
+        other is not found and 2 * len(other.pairs) > k and other.overlaps(found) and found.differs(other)
         for other in all_
     )
     # as likely by chance: the ratio exceeds 1 over it as seldom; one that the covariance excludes is less likely yet
     if score <= -math.log(FALSE_ALARMS if agrees else SURE):
         return None
-    sure, newer = bool(p <= SURE and fits and not rivals), _newer(look, T, pairs)
+    sure, young = bool(p <= SURE and fits and not rivals), _newer(of, T, pairs)
     if sure:  # then two of a pair that were seen in one scan were so by a wrong association
-        a, b = _matched(look, T, pairs, ~newer, newer)
-        pairs = np.column_stack([a, b])[~(look.given[a] & look.given[b])]
+        pairs = matched(of, T, pairs, ~young, young)
+        pairs = pairs[~of.given[pairs].all(axis=1)]
     named = [(look.names[a], look.names[b]) for a, b in pairs.tolist()]
-    named_newer = [look.names[i] for i in np.flatnonzero(newer).tolist()]
-    middle = look.places[pairs[:, 1]].mean(axis=0)
-    shift = middle - look.places[pairs[:, 0]].mean(axis=0)
-    return Repeat(named, T, middle, shift, score, p, agrees, sure, named_newer)
+    named_newer = [look.names[i] for i in np.flatnonzero(young).tolist()]
+    older, middle, b = (np.array([z.real, z.imag]) for z in (*of.z[pairs].mean(axis=0), T[1]))
+    return Repeat(named, np.append(b, np.angle(T[0])), middle, middle - older, score, p, agrees, sure, named_newer)
 
 
-def _newer(look: _RepeatCandidates, T: Array, pairs: Index) -> Flags:
+def _newer(of: Places, T: Transform, pairs: Index) -> Flags:
     """Return which landmarks (N,) are of the newer part: begun since its onset, and seen with no more of the older one.
 
     The onset is where most of those that T moves onto younger ones have one on either side, others were taken for
     another; of such times that which parts fewest landmarks that were seen together.
     """
-    n, every = len(look.names), np.ones(len(look.names), dtype=np.bool_)
-    a, b = _matched(look, T, pairs, every, every)
-    pairs = np.column_stack([a, b])[a < b]
-    onset = int(np.lexsort((_parted(np.column_stack(np.divmod(look.codes, n)), n), -_parted(pairs, n)))[0])
-    sides = _sides(look, pairs[(pairs[:, 0] < onset) & (onset <= pairs[:, 1])])
-    return np.asarray((sides <= 0) & (np.arange(n) >= onset))
+    n, every = len(of.z), np.ones(len(of.z), dtype=np.bool_)
+    pairs = matched(of, T, pairs, every, every)
+    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
+    together = np.column_stack([np.repeat(np.arange(n), np.diff(of.first)), of.seen])
+    onset = int(np.lexsort((_parted(together, n), -_parted(pairs, n)))[0])
+    votes = sides(of, pairs[(pairs[:, 0] < onset) & (onset <= pairs[:, 1])])
+    return np.asarray((votes <= 0) & (np.arange(n) >= onset))
 
 
 def _parted(pairs: Index, n: int) -> Index:
@@ -403,14 +273,7 @@ def _parted(pairs: Index, n: int) -> Index:
     return np.asarray(begun - ended)
 
 
-def _differ(one: _Constellation, other: _Constellation) -> bool:
-    """Return whether two constellations pair the same landmarks with others."""
-    mine = {frozenset(pair) for pair in one.pairs.tolist()}
-    its = {frozenset(pair) for pair in other.pairs.tolist()}
-    return 2 * len(mine & its) < min(len(mine), len(its))
-
-
-def _self_similarity(look: _RepeatCandidates, part: Index) -> float:
+def _self_similarity(of: Places, part: Index) -> float:
     """Return the probability with which landmarks of a part agree with others of it that are certainly different.
 
     Each edge between two that were seen together is moved on each other; the probability is that of which the best
@@ -418,27 +281,8 @@ def _self_similarity(look: _RepeatCandidates, part: Index) -> float:
     """
     from scipy.special import betaincinv
 
-    middle = look.places[part].mean(axis=0)
-    part = part[np.argsort(np.linalg.norm(look.places[part] - middle, axis=1), kind="stable")[:SAMPLE]]
-    p = look.places[part]
-    a, b = (x.ravel() for x in np.meshgrid(np.arange(len(part)), np.arange(len(part)), indexing="ij"))
-    far = np.linalg.norm(p[a] - p[b], axis=1)
-    rank = np.argsort(np.argsort(far.reshape(len(part), -1), axis=1), axis=1).ravel()
-    edges = np.flatnonzero((a != b) & (rank <= NEAREST))
-    one, two = (x.ravel() for x in np.meshgrid(edges, edges, indexing="ij"))
-    alike = (np.abs(far[one] - far[two]) <= 2.0 * look.tolerance) & (a[one] != a[two]) & (b[one] != b[two])
-    alike &= ~look.may_be(part[a[one]], part[a[two]]) & ~look.may_be(part[b[one]], part[b[two]])
-    chosen, number = np.flatnonzero(alike), int(alike.sum())
-    chosen = chosen[:: max(1, -(-len(chosen) // MOVES))]
-    if not len(chosen):
-        return 0.0
-    one, two = one[chosen], two[chosen]
-    T = _transforms(np.stack([p[a[one]], p[b[one]]], axis=1), np.stack([p[a[two]], p[b[two]]], axis=1))
-    moved = _moved(T, p)  # (M, K, 2)
-    gaps = (moved[:, :, None, 0] - p[:, 0]) ** 2 + (moved[:, :, None, 1] - p[:, 1]) ** 2
-    gaps[:, np.arange(len(p)), np.arange(len(p))] = np.inf
-    k = (gaps.min(axis=2) <= look.tolerance**2).sum(axis=1) - 2
-    m = _inside(p, moved.reshape(-1, 2)).reshape(len(T), -1).sum(axis=1) - 2
+    far = np.abs(of.z[part] - of.z[part].mean())
+    k, m, number = agreement_with_itself(of, part[np.argsort(far, kind="stable")[:SAMPLE]])
     some = (k > 0) & (m > 0)
     if not some.any():
         return 0.0
@@ -446,33 +290,29 @@ def _self_similarity(look: _RepeatCandidates, part: Index) -> float:
     return float(betaincinv(k, m - k + 1, 1.0 / number).max())
 
 
-def _weighed(look: _RepeatCandidates, T: Array, pairs: Index, density: float) -> tuple[float, bool, bool]:
+def _weighed(look: _RepeatCandidates, T: Transform, pairs: Index, density: float) -> tuple[float, bool, bool]:
     """Return the log-likelihood ratio of pairs that are one, T unknown, whether their shapes fit, and places do."""
     some = pairs[:: max(1, -(-len(pairs) // WEIGHED))]
-    k, rows = len(some), np.concatenate([some[:, 0], some[:, 1]])
-    P, p = look.covariance(rows), look.places[rows]
-    moved = from_frame(T, p[:k])[0]
-    slack = (SLACK * look.spacing / 2) ** 2 * np.eye(2 * k)
-    c, s = math.cos(T[2]), math.sin(T[2])
-    J = np.hstack([-np.kron(np.eye(k), np.array([[c, -s], [s, c]])), np.eye(2 * k)])
-    offset = moved - moved.mean(axis=0)
-    G = np.column_stack([np.tile(np.eye(2), (k, 1)), np.column_stack([-offset[:, 1], offset[:, 0]]).ravel()])
-    extent = float(np.ptp(look.places, axis=0).max())
+    k, of, (a, b) = len(some), look.places, T
+    p, q = of.z[some[:, 0]], of.z[some[:, 1]]
+    P, moved = _joint_covariance(look.map, look.slots[some.T.ravel()]), a * p + b
+    slack = (SLACK * of.spacing / 2) ** 2 * np.eye(2 * k)
+    G = np.column_stack([np.tile(np.eye(2), (k, 1)), (1j * (moved - moved.mean())).view(np.float64)])
+    extent = max(np.ptp(of.z.real), np.ptp(of.z.imag))
     prior = np.diag([extent**2, extent**2, math.pi**2 / 3.0])
-    Z = J @ P @ J.T + slack + G @ prior @ G.T
-    z = p[k:] - moved
-    score = float(log_ratios(z, Z, np.full(k, math.log(density))).ratio.sum())
-    fits = z.ravel() @ np.linalg.solve(Z, z.ravel()) <= chi2_gate(FITS, 2 * k - 3)
-    J = np.hstack([-np.eye(2 * k), np.eye(2 * k)])
-    Z = J @ P @ J.T + EQUAL_M**2 * np.eye(2 * k) + slack
-    z = (p[k:] - p[:k]).ravel()
-    return score, bool(fits), bool(z @ np.linalg.solve(Z, z) <= chi2_gate(GATE, 2 * k))
+    Z = _of_differences(P, np.array([[a.real, -a.imag], [a.imag, a.real]])) + slack + G @ prior @ G.T
+    z = (q - moved).view(np.float64)
+    d2 = float(z @ np.linalg.solve(Z, z))
+    score = -0.5 * (d2 + float(np.linalg.slogdet(Z)[1])) - k * math.log(2.0 * math.pi * density)
+    Z = _of_differences(P, np.eye(2)) + EQUAL_M**2 * np.eye(2 * k) + slack
+    z = (q - p).view(np.float64)
+    return score, d2 <= chi2_gate(FITS, 2 * k - 3), bool(z @ np.linalg.solve(Z, z) <= chi2_gate(GATE, 2 * k))
 
 
 # ---------------------------------------------------------------------- merging
 def is_due(tracks: Tracks) -> bool:
     """Return whether so many landmarks have come or gone that a map should be searched again."""
-    return tracks.changes - tracks.searched >= max(GROWN, GROWN_BY * len(tracks.confirmed))
+    return tracks.changes - tracks.searched >= GROWN
 
 
 def is_in(part: list[Id], tracks: Tracks) -> bool | None:
@@ -483,24 +323,17 @@ def is_in(part: list[Id], tracks: Tracks) -> bool | None:
     return None if not inside or abs(share - 0.5) < CLEAR else share > 0.5
 
 
-class Displacement(NamedTuple):
-    """Blocks `slots` whose means move to `means`, and the covariance of their rows to F P F' + Q."""
+def displacement(map_: Map, slots: list[int], repeat: Repeat) -> tuple[list[Array], Array, Array]:
+    """Return the means to which blocks of the newer part of a repeat move, and F and Q of their rows: F P F' + Q.
 
-    slots: list[int]
-    means: list[Array]
-    F: Array
-    Q: Array
-
-
-def displacement(map_: Map, slots: list[int], repeat: Repeat) -> Displacement:
-    """Return the move of blocks of the newer part of a repeat onto the older one, of an error unknown until now.
+    They move onto the older part, of an error unknown until now.
 
     The shift and the turn of the whole part, about the middle of its pairs, have sigmas as large as they are: a robot
     that lost its way by so much might have lost it so.
     """
     R, turn = rotation(-repeat.T[2]), -float(repeat.T[2])
     t = -R @ repeat.T[:2]
-    middle = from_frame(np.array([*t, turn]), repeat.middle)[0]
+    middle = R @ repeat.middle + t
     means, F, G = [], [], []
     for slot in slots:
         space, x = map_.spaces[slot], map_.mean(slot)
@@ -519,6 +352,4 @@ def displacement(map_: Map, slots: list[int], repeat: Repeat) -> Displacement:
         F.append(F_x)
         G.append(G_x)
     far, all_ = float(repeat.shift @ repeat.shift), np.concatenate(G)
-    return Displacement(
-        slots, means, block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T
-    )
+    return means, block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T

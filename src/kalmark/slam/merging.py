@@ -101,10 +101,10 @@ def search_repeats(state: State, scan: ScanContext, policy: Policy) -> None:
 
     One is merged at a time: it changes the map.
     """
-    state.tracks.searched = state.tracks.changes
+    since, state.tracks.searched = state.tracks.searched, state.tracks.changes
     found: list[Repeat] = []
     with suppress(np.linalg.LinAlgError):
-        found = of_map.find_repeats(state.map, state.tracks)
+        found = of_map.find_repeats(state.map, state.tracks, since)
     for repeat in found:
         if policy.upkeep.repeats == "merge" and repeat.sure and (repeat.agrees or _displace(state, scan, repeat)):
             merged = _merge_pairs(state, scan, merge.Merge(repeat.pairs, repeat.score))
@@ -127,13 +127,10 @@ def _displace(state: State, scan: ScanContext, repeat: Repeat) -> bool:
     if inside:
         slots += [scan.robot, *(track.slot for track in state.tracks.tentative.values())]
         slots += [clone.slot for clone in state.clones.clones.values()]
-    try:
-        moved = of_map.displacement(state.map, slots, repeat)
-    except np.linalg.LinAlgError:
-        return False
+    means, F, Q = of_map.displacement(state.map, slots, repeat)
     rows, before = state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots)), state.map.mean(scan.robot)
-    state.map.predict(rows, moved.F, moved.Q)
-    for slot, mean in zip(moved.slots, moved.means, strict=True):
+    state.map.predict(rows, F, Q)
+    for slot, mean in zip(slots, means, strict=True):
         state.map.set_predicted(slot, mean)
     of = state.evidence.get(scan.event.robot)
     if inside and of is not None:

@@ -446,7 +446,8 @@ class Slam(Estimate):
             state.tracks.rename_tentative([name])
             state.tracks.known.add(name, model, mean)
             return
-        state.tracks.enter(Track(name, model, state.map.add(model.space, mean, cov)))
+        slot = state.map.add(model.space, mean, cov)
+        state.tracks.enter(Track(name, model, slot, entered=state.tracks.changes))
         state.surveys.trial[name] = 0
         state.let_grow()
 

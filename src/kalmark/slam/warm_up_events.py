@@ -19,6 +19,7 @@ from kalmark.filter.compressed.storage import Triangle
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.spaces import VECTOR, VECTOR3
+from kalmark.management.repeated_places import find_repeats
 from kalmark.models.landmark_views import Spatial
 from kalmark.models.model_check import views
 from kalmark.models.protocols import (
@@ -33,7 +34,7 @@ from kalmark.models.protocols import (
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.merging import make_equal
 from kalmark.slam.robot import IDENTITY, Mount, Robot
-from kalmark.tracks.track import ChannelKey
+from kalmark.tracks.track import ChannelKey, Track, Tracks
 
 ROUNDS = 12  # of a control and scans: enough for whatever waits for several
 SEEN = 3  # observations in a scan
@@ -146,13 +147,27 @@ def _scan(twin: Estimate, key: ChannelKey, y: Array, ids: list[Id] | None) -> Sc
 
 
 def _merge(twin: Estimate) -> None:
-    """Make two landmarks equal, as where observations have no ids: through a model in Python."""
+    """Make two landmarks equal, as where observations have no ids: through a model in Python; search for repeats."""
     for (robot, sensor), policy in twin.state.policies.items():
         channel = twin.state.channels[robot, sensor]
+        if policy.upkeep.repeats != "off":
+            with suppress(Exception):
+                _search_repeats(channel.landmark)
         mine = [track.id for track in twin.tracks.confirmed.values() if track.model.kind == channel.landmark.kind]
         if not isinstance(policy.association, ByIdentity) and policy.upkeep.merge and len(mine) > 1:
             with suppress(Exception):
                 make_equal(twin.state, channel, twin.state.moving[robot].slot, [(mine[0], mine[1])])
+
+
+def _search_repeats(landmark: Landmark) -> None:
+    """Search a map in which a place is twice."""
+    map_, tracks, places = StochasticMap(), Tracks([]), np.random.default_rng(0).uniform(0.0, 9.0, (9, 2))
+    for x in (0, 20):
+        names = [f"u{x + k}" for k in range(len(places))]
+        for name, place in zip(names, places + x, strict=True):
+            slot = map_.add(landmark.space, place, 1e-4 * np.eye(2))
+            tracks.confirm(Track(name, landmark, slot, covisible={*names}))
+    find_repeats(map_, tracks)
 
 
 def made_up_events(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
