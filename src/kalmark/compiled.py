@@ -26,11 +26,11 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from functools import cache
+from functools import cache, wraps
 from importlib import import_module
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO, TypeVar, cast
 
 import llvmlite.binding
 import numba
@@ -142,6 +142,27 @@ def python_form(function: F) -> F:
 def form_for(model: Any, function: F) -> F:
     """Return a compiled function for a compiled model, which is a tuple, and its Python form for a user's."""
     return function if isinstance(model, tuple) else python_form(function)
+
+
+def compiled_by_model(function: F) -> F:
+    """Return a function of a model and more, compiled; with a user's model, which is no tuple, it runs as Python.
+
+    Both forms of a function call it by this name.
+    """
+    fast = compiled(function)
+
+    @wraps(function)
+    def either(model: Any, *more: Any) -> Any:
+        return form_for(model, fast)(model, *more)
+
+    def of_types(model: Any, *more: Any) -> Any:
+        def call(model, *more):  # type: ignore[no-untyped-def]
+            return fast(model, *more)
+
+        return call if isinstance(model, types.BaseTuple) else None
+
+    overload(either, strict=False)(of_types)
+    return cast("F", either)
 
 
 class _Folder(UserProvidedCacheLocator):  # type: ignore[misc, unused-ignore]

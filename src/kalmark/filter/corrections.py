@@ -21,7 +21,7 @@ from numba import types
 from numba.extending import overload
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.compiled import address_of, by_address, compiled, signature_of
+from kalmark.compiled import address_of, by_address, compiled, compiled_by_model, signature_of
 from kalmark.filter import gauge_transport, parallax
 from kalmark.filter.gauge_transport import (
     TURNING,
@@ -135,7 +135,7 @@ def take_entries(values: Any, rows: Index) -> Any:
     return out
 
 
-@compiled
+@compiled_by_model
 def predicted(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array, Block, Linear]:
     """Return e and z of each observation, the block that a scan observes, and the scan linearised at the block's mean.
 
@@ -161,7 +161,7 @@ def predicted(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array, Block, L
     return e, z, (index, places, table, mean, P_ss, sizes, turning_rows(table, sizes, linear[1])), linear
 
 
-@compiled
+@compiled_by_model
 def coordinates(
     model: Any, ways: Routines, turns: tuple[Turning, Sizes], placed: Placed, P: Array, iterates: bool
 ) -> Coordinates:  # fmt: skip
@@ -184,7 +184,7 @@ def coordinates(
     return placed, head, theta, L, R_r, generator, (depths, s, S, c2), turns
 
 
-@compiled
+@compiled_by_model
 def retract_in(
     model: Any, ways: Routines, prior: Coordinates, x: Array, correction: Array
 ) -> tuple[Array, Array, Array]:  # fmt: skip
@@ -365,7 +365,7 @@ def invariant(
     return e, z, Z, d2, near, valid
 
 
-@compiled
+@compiled_by_model
 def fuse_scan(
     model: Any, map_: Map, block: Block, linear: tuple[Array, Array, Array], count: int, iterates: bool
 ) -> None:  # fmt: skip
