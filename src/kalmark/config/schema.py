@@ -107,76 +107,31 @@ class SpaceMountConfig(SpacePose):
     """
 
 
-class StartConfig(PlanePose):
+def _with_state(base: type[Section], world: str, sigma: Any, each: str) -> Any:
+    """Return a section with the keys of what a state has behind its pose; `sigma` and `each` are of their sigmas."""
+    text = "Components of the state after its pose, of a motion of your own with other names than these."
+    keys: dict[str, Any] = {name: (Number, Field(0.0, description=text)) for name, text in STATES[world].items()}
+    keys |= {sigma_of(name)[0]: (sigma, Field(0.0, description=each)) for name in STATES[world]}
+    return create_model("Start", __base__=base, **keys, state=(Numbers | None, Field(None, description=text)))
+
+
+OF_PLANE: Any = _with_state(PlanePose, "plane", NotNegative, "Standard deviation of each such component.")
+OF_SPACE: Any = _with_state(
+    SpacePose, "space", Sigmas, "Standard deviation of each such component; or a list of three."
+)
+
+
+class StartConfig(OF_PLANE):  # type: ignore[misc]
     """Start of a robot of the plane, and its sigmas."""
 
-    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys((*POSE_OF_SPACE, *STATES["space"][2:]), _SPACE_FOR_PLANE)
-
-    vx_mps: Number = 0.0
-    """constant_velocity, constant_turn_rate: velocity forward."""
-    vy_mps: Number = 0.0
-    """constant_velocity: velocity to the left."""
-    w_radps: Number = 0.0
-    """constant_velocity, constant_turn_rate: turn rate."""
-    slip: Number = 0.0
-    """slipping_unicycle: velocity to the left, as a share of the speed."""
-    sigma_v_mps: NotNegative = 0.0
-    """constant_velocity, constant_turn_rate: standard deviation of each velocity."""
-    sigma_w_radps: NotNegative = 0.0
-    """constant_velocity, constant_turn_rate: standard deviation of the turn rate."""
-    sigma_slip: NotNegative = 0.0
-    """slipping_unicycle: standard deviation of the slip."""
-    state: Numbers | None = None
-    """Components of the state after its pose, of a motion of your own with other names than these."""
+    elsewhere: ClassVar[dict[str, str]] = dict.fromkeys((*POSE_OF_SPACE, *[*STATES["space"]][2:]), _SPACE_FOR_PLANE)
 
 
-class SpaceStartConfig(SpacePose):
+class SpaceStartConfig(OF_SPACE):  # type: ignore[misc]
     """Start of a robot of space, and its sigmas; turned by roll, then pitch, then yaw about the world's axes."""
 
     at_rest: bool = False
     """inertial: roll, pitch (or the gravity) and the bias of the rate are found from the log, which begins at rest."""
-    vx_mps: Number = 0.0
-    """constant_velocity_3d, inertial: velocity in the world."""
-    vy_mps: Number = 0.0
-    """constant_velocity_3d, inertial: velocity in the world."""
-    vz_mps: Number = 0.0
-    """constant_velocity_3d, inertial: velocity in the world."""
-    wx_radps: Number = 0.0
-    """constant_velocity_3d: rate about the robot's own x."""
-    wy_radps: Number = 0.0
-    """constant_velocity_3d: rate about the robot's own y."""
-    wz_radps: Number = 0.0
-    """constant_velocity_3d: rate about the robot's own z."""
-    sigma_v_mps: Sigmas = 0.0
-    """constant_velocity_3d, inertial: standard deviation of each velocity; or a list of three."""
-    sigma_w_radps: Sigmas = 0.0
-    """constant_velocity_3d: standard deviation of each rate; or a list of three."""
-    bias_wx_radps: Number = 0.0
-    """inertial: bias of the rate about x."""
-    bias_wy_radps: Number = 0.0
-    """inertial: bias of the rate about y."""
-    bias_wz_radps: Number = 0.0
-    """inertial: bias of the rate about z."""
-    bias_ax_mps2: Number = 0.0
-    """inertial: bias of the specific force along x."""
-    bias_ay_mps2: Number = 0.0
-    """inertial: bias of the specific force along y."""
-    bias_az_mps2: Number = 0.0
-    """inertial: bias of the specific force along z."""
-    gravity_x_mps2: Number = 0.0
-    """inertial_gravity: gravity in the map's frame."""
-    gravity_y_mps2: Number = 0.0
-    """inertial_gravity: gravity in the map's frame."""
-    gravity_z_mps2: Number = 0.0
-    """inertial_gravity: gravity in the map's frame."""
-    sigma_bias_w_radps: Sigmas = 0.0
-    """inertial: standard deviation of each bias of the rate; or a list of three."""
-    sigma_bias_a_mps2: Sigmas = 0.0
-    """inertial: standard deviation of each bias of the specific force; or a list of three."""
-    sigma_gravity_mps2: Sigmas = 0.0
-    """inertial_gravity: standard deviation of each coordinate of the gravity; or a list of three."""
-    state: Numbers | None = None
-    """Components of the state after its pose, of a motion of your own with other names than these."""
 
 
 @register("initialization", "immediate")

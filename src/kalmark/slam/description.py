@@ -44,14 +44,21 @@ from kalmark.slam.state import Settings
 Description = dict[str, Any]
 
 STATES = {
-    "plane": ("vx_mps", "vy_mps", "w_radps", "slip"),
-    "space": (
-        "vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps",
-        "bias_wx_radps", "bias_wy_radps", "bias_wz_radps", "bias_ax_mps2", "bias_ay_mps2", "bias_az_mps2",
-        "gravity_x_mps2", "gravity_y_mps2", "gravity_z_mps2",
-    ),
-}  # fmt: skip
-"""Components of a state after its pose, as keys of a start."""
+    "plane": {
+        "vx_mps": "constant_velocity, constant_turn_rate: velocity forward.",
+        "vy_mps": "constant_velocity: velocity to the left.",
+        "w_radps": "constant_velocity, constant_turn_rate: turn rate.",
+        "slip": "slipping_unicycle: velocity to the left, as a share of the speed.",
+    },
+    "space": {
+        **dict.fromkeys(("vx_mps", "vy_mps", "vz_mps"), "constant_velocity_3d, inertial: velocity in the world."),
+        **{f"w{axis}_radps": f"constant_velocity_3d: rate about the robot's own {axis}." for axis in "xyz"},
+        **{f"bias_w{axis}_radps": f"inertial: bias of the rate about {axis}." for axis in "xyz"},
+        **{f"bias_a{axis}_mps2": f"inertial: bias of the specific force along {axis}." for axis in "xyz"},
+        **{f"gravity_{axis}_mps2": "inertial_gravity: gravity in the map's frame." for axis in "xyz"},
+    },
+}
+"""Components of a state after its pose, as keys of a start, with their documentation."""
 SIGMAS = {
     "plane": (("sigma_xy_m", 0), ("sigma_xy_m", 1), ("sigma_theta_rad", 0)),
     "space": (*(("sigma_position_m", k) for k in range(3)), *(("sigma_rotation_deg", k) for k in range(3))),
