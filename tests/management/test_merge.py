@@ -129,7 +129,8 @@ def test_a_landmark_seen_without_any_other_may_still_be_one_of_the_map() -> None
 
 def may_be(slam: km.Slam, name: Any) -> list[list[merge.Pair]]:
     """Return what a landmark and others may be."""
-    return list(merge._hypotheses(merge._Reading(slam.map, slam.tracks, slam.slot("cart"), 2), name))
+    look = merge._Reading(slam.map, slam.tracks, slam.slot("cart"), 2, merge.EQUAL_M)
+    return list(merge._hypotheses(look, name, slam.mean(name)))
 
 
 def named_again(slam: km.Slam) -> list[str]:
@@ -242,3 +243,19 @@ def test_a_landmark_is_looked_at_again_where_something_is_new_and_ever_less_ofte
                 slam.save(tmp_path / "state.kalmark")
                 slam = km.Slam.load(tmp_path / "state.kalmark")
     assert asked == [5, 10, 15, 30, 60]
+
+
+@pytest.mark.parametrize(("off", "is_one"), [(0.1, True), (1.0, False)])
+def test_landmarks_nearer_than_the_covariance_allows_are_one_where_that_is_little_of_their_spacing(
+    off: float, is_one: bool
+) -> None:
+    slam, ring = slam_of(), 5.0 * np.exp(1j * np.arange(6))
+    places = [*zip(ring.real, ring.imag, strict=True), (0.0, 0.0), (off, 0.0)]
+    names = [f"u{k}" for k in range(1, 9)]
+    for name, place in zip(names, places, strict=True):
+        slam.add_landmark(name, place, 1e-4 * np.eye(2))
+    slam.tracks.reserved.clear()  # as if all had been made up
+    slam.tracks.note_scan(names[:7])
+    slam.tracks.note_scan([*names[:6], names[7]])
+    found = merge.proposal(slam.map, slam.tracks, "u8", slam.slot("cart"), np.zeros(3), 100.0)
+    assert (found is not None and found.pairs == [("u8", "u7")]) is is_one

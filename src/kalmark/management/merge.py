@@ -36,6 +36,7 @@ WIDE = 1.5  # times the gate of the nearest it may be, within which all are that
 SLACK_M, SLACK_RAD = 0.3, 0.3  # by which covisible landmarks may miss, and by which they may be turned
 GATE = 0.99
 EQUAL_M = 1e-4  # how equal two landmarks are made
+SLACK = 0.02  # of the spacing of landmarks: a sigma for errors that are not in the covariance
 LINEAR = (VECTOR, VECTOR3, SCALAR)  # atoms of which a difference is one
 
 
@@ -99,12 +100,14 @@ def proposal(map_: Map, tracks: Tracks, name: Id, robot: int, sensor: Array, odd
 
     Its possible partners are tried one by one: the others, moved along, are paired with their nearest.  Of the
     hypotheses with most pairs, the one of the largest log ratio must be accepted at these odds against chance and
-    against any other that has no pair in common with it.  `robot` is the slot of a robot, `sensor` (3,) or (7,) the
-    pose of the sensor.
+    against any other that has no pair in common with it.  They may miss by `SLACK` of the distance to the nearest that
+    was seen with the first.  `robot` is the slot of a robot, `sensor` (3,) or (7,) the pose of the sensor.
     """
     d = 2 if len(sensor) == 3 else 3
-    look, tried = _Reading(map_, tracks, robot, d), []
-    for pairs in _hypotheses(look, name):
+    l = map_.means(tracks.slots_of([name, *(tracks.confirmed[name].covisible & tracks.confirmed.keys() - {name})]), d)
+    slack_m = max(SLACK * min(np.linalg.norm(l[1:] - l[0], axis=1), default=0.0), EQUAL_M)
+    look, tried = _Reading(map_, tracks, robot, d, slack_m), []
+    for pairs in _hypotheses(look, name, l[0]):
         z, Z = look.differences(pairs)
         chance = log_density_about(map_, tracks, [name], sensor)
         of_classes = [distance_of_landmarks(*(tracks.confirmed[n].classes for n in pair)) for pair in pairs]
@@ -138,12 +141,13 @@ def order_pairs(tracks: Tracks, pairs: Sequence[Pair]) -> list[Pair]:
 
 
 class _Reading(NamedTuple):
-    """Data to compare landmarks of d dimensions."""
+    """Data to compare landmarks of d dimensions, which may miss by `slack_m`."""
 
     map: Map
     tracks: Tracks
     robot: int
     d: int
+    slack_m: float
 
     def places(self, names: Sequence[Id]) -> Array:
         """Return where landmarks are (N, d)."""
@@ -165,14 +169,15 @@ class _Reading(NamedTuple):
         of[rows, [at[b] for _, b in pairs]] = 1.0
         of[rows, [at[a] for a, _ in pairs]] = -1.0
         J = (of[:, None, :, None] * np.eye(n)[:, None]).reshape(len(pairs) * n, -1)
-        return of @ m.means(here, n), J @ P @ J.T + EQUAL_M**2 * np.eye(len(J))
+        slack = np.where(np.arange(n) < self.d, self.slack_m, EQUAL_M) ** 2
+        return of @ m.means(here, n), J @ P @ J.T + np.diag(np.tile(slack, len(pairs)))
 
 
-def _hypotheses(look: _Reading, name: Id) -> Iterator[list[Pair]]:
-    """Return what a landmark and others recently observed may be: lists of pairs, its own first."""
+def _hypotheses(look: _Reading, name: Id, at: Array) -> Iterator[list[Pair]]:
+    """Return what a landmark `at` (d,) and others recently observed may be: lists of pairs, its own first."""
     from scipy.spatial import cKDTree
 
-    tracks, at = look.tracks, look.places([name])[0]
+    tracks = look.tracks
     for count in (NEAR, NEAREST):  # most can be none of those nearby, and so of none
         others, possible = _others(look, name, at, count)
         enough = count == NEAREST or len(possible) >= FEW
@@ -247,4 +252,4 @@ def _is_out_of_reach(look: _Reading, name: Id, others: Sequence[Id]) -> bool:
     i = int(np.argmin(far))
     P = m.covariance([here[0], here[1 + i]])
     n = len(P) // 2
-    return bool(far[i] > _reach(P[:n, :n] + P[n:, n:] - P[:n, n:] - P[n:, :n] + EQUAL_M**2 * np.eye(n)))
+    return bool(far[i] > _reach(P[:n, :n] + P[n:, n:] - P[:n, n:] - P[n:, :n] + look.slack_m**2 * np.eye(n)))

@@ -25,7 +25,7 @@ from kalmark.events import Id
 from kalmark.filter.map import Map
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.gaussian import gate as chi2_gate
-from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR
+from kalmark.geometry.spaces import SCALAR, VECTOR
 from kalmark.management.constellations import (
     NEAREST,
     Places,
@@ -38,7 +38,7 @@ from kalmark.management.constellations import (
     matched,
     sides,
 )
-from kalmark.management.merge import EQUAL_M, GATE
+from kalmark.management.merge import EQUAL_M, GATE, SLACK
 from kalmark.report import Repeat
 from kalmark.tracks.track import Tracks
 
@@ -47,7 +47,6 @@ TRIES = 24  # constellations
 JUDGED = 6  # constellations, the largest
 FEWEST = 5  # pairs
 SIGMAS = 4.0  # by which landmarks that agree may miss, and
-SLACK = 0.04  # of the spacing of landmarks, for errors that are not in the covariance
 FALSE_ALARMS = 1e-3  # expected of a map without repeats
 SAMPLE = 40  # landmarks of a part that is compared with itself
 WEIGHED = 40  # pairs that are weighed together
@@ -117,7 +116,7 @@ class _RepeatCandidates:
         chosen = some[:: max(1, len(some) // SAMPLE)]
         P = _of_differences(_joint_covariance(map_, slots[np.append(chosen, near[chosen, 0])]), np.eye(2))
         sigma = math.sqrt(max(float(np.median(np.diag(P).reshape(-1, 2).mean(axis=1))), 0.0))  # relative to the nearest
-        tolerance = SIGMAS * sigma + SLACK * spacing
+        tolerance = SIGMAS * sigma + 2.0 * SLACK * spacing
         places = Places(z, z.real[by_x], by_x, first, seen, given, tolerance, spacing)
         return cls(map_, names, slots, places, near, np.array([track.entered >= since for track in points]))
 
@@ -225,9 +224,7 @@ def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constell
         p = max(p, 2.0 * float(edges**2 * betainc(few * k - 2, few * (m - k) + 1, each)))
         if p > FALSE_ALARMS:
             return None
-    pairs = found.pairs
-    if np.median(pairs[:, 0]) > np.median(pairs[:, 1]):  # the order of landmarks is that of their age
-        pairs = np.ascontiguousarray(pairs[:, ::-1])
+    pairs = found.pairs.take(np.argsort(np.median(found.pairs, axis=0), kind="stable"), axis=1)  # the older first
     older, newer = of.z[pairs[:, 0]], of.z[pairs[:, 1]]
     T = fit(older, newer)
     if np.median(np.abs(T[0] * newer + T[1] - older)) <= of.spacing / 2:
@@ -296,7 +293,7 @@ def _weighed(look: _RepeatCandidates, T: Transform, pairs: Index, density: float
     k, of, (a, b) = len(some), look.places, T
     p, q = of.z[some[:, 0]], of.z[some[:, 1]]
     P, moved = _joint_covariance(look.map, look.slots[some.T.ravel()]), a * p + b
-    slack = (SLACK * of.spacing / 2) ** 2 * np.eye(2 * k)
+    slack = (SLACK * of.spacing) ** 2 * np.eye(2 * k)
     G = np.column_stack([np.tile(np.eye(2), (k, 1)), (1j * (moved - moved.mean())).view(np.float64)])
     extent = max(np.ptp(of.z.real), np.ptp(of.z.imag))
     prior = np.diag([extent**2, extent**2, math.pi**2 / 3.0])
@@ -336,20 +333,14 @@ def displacement(map_: Map, slots: list[int], repeat: Repeat) -> tuple[list[Arra
     middle = R @ repeat.middle + t
     means, F, G = [], [], []
     for slot in slots:
-        space, x = map_.spaces[slot], map_.mean(slot)
-        assert space is not None
-        moved, F_x = space.rotated(x, turn), np.eye(space.dof)
-        G_x = np.zeros((space.dof, 3))
-        for kind, at, k in space.atoms.tolist():
-            if kind == VECTOR:
-                moved[at : at + 2] += t
-                off = moved[at : at + 2] - middle
-                F_x[k : k + 2, k : k + 2] = R
-                G_x[k : k + 2] = [[1.0, 0.0, -off[1]], [0.0, 1.0, off[0]]]
-            elif kind == HEADING:
-                G_x[k] = [0.0, 0.0, 1.0]
+        space = map_.spaces[slot]
+        assert space is not None  # its place comes first
+        moved, F_x = space.rotated(map_.mean(slot), turn), np.eye(space.dof)
+        moved[:2] += t
+        F_x[:2, :2] = R
         means.append(moved)
         F.append(F_x)
-        G.append(G_x)
+        off = np.append(moved[:2] - middle, moved[2:])
+        G.append(np.hstack([np.eye(space.dof, 2), space.generator(off)]))
     far, all_ = float(repeat.shift @ repeat.shift), np.concatenate(G)
     return means, block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T
