@@ -217,7 +217,7 @@ def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     )
     of_world = FRAMES[len(scan.channel.at)]
     to_robot = of_world.compose(of_world.inverse(scan.pose())[0], r[: len(found.T)])[0]
-    write_robot(other.map, scan.robot, of_world.compose(found.T, to_robot)[0], found.cov)
+    write_robot(other.map, other.moving, of_world.compose(found.T, to_robot)[0], found.cov)
     of.gain, of.fitted = found.gain, {old.names[row] for row in found.matched if row >= 0}
 
 
