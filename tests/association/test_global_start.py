@@ -17,6 +17,7 @@ from kalmark.association.global_start import (
     distinct,
     hypotheses,
     locate_points,
+    locate_ranges,
     locate_rays,
     locate_tags,
     points_at_poses,
@@ -187,6 +188,27 @@ def test_directions_determine_a_pose_if_all_agree(d: int) -> None:
     off = SE2.minus(found.T, pose) if d == 2 else SE3.minus(found.T, pose)
     assert off @ np.linalg.solve(found.cov, off) < 12.0
     assert isinstance(locate_rays(of, [0, 1], v[:2], np.full(2, 0.002)), str)
+
+
+def test_four_ranges_determine_a_place_of_space_or_that_and_its_mirror_image() -> None:
+    rng, pose = np.random.default_rng(8), np.array([1.0, -2.0, 0.5, 0.0, 0.0, 0.6, 0.8])
+    sigma = np.full(9, 0.02)
+    for height_m, number in ((6.0, 9), (6.0, 4), (0.0, 9)):  # landmarks up to so high over 4 m, and how many are seen
+        l = np.column_stack([rng.uniform(-9, 9, (9, 2)), 4.0 + rng.uniform(0.0, height_m, 9)])
+        of = Known(km.landmarks.Point3D())
+        for i, place in enumerate(l):
+            of.add(i, place)
+        r = np.linalg.norm(l - pose[:3], axis=1) + rng.normal(0.0, sigma)
+        found = locate_ranges(of, [*range(9)][:number], pose, r[:number], sigma[:number])
+        assert isinstance(found, Proposal)
+        off = found.T[:3] - pose[:3]
+        assert off @ np.linalg.solve(found.cov[:3, :3], off) < 16.3, ".999 of chi-square of 3"
+        np.testing.assert_array_equal(found.T[3:], pose[3:])
+        above = locate_ranges(of, [*range(number)], pose + np.eye(7)[2] * 20.0, r[:number], sigma[:number])
+        assert isinstance(above, Proposal)
+        assert (above.T[2] > 4.0) == (height_m == 0.0), "of a flat ceiling the place on the side where it was"
+    assert isinstance(locate_ranges(of, [0, 1, 2], pose, r[:3], sigma[:3]), str)
+    assert isinstance(locate_ranges(of, [*range(9)], pose, r + np.eye(9)[0], sigma), str), "one does not agree"
 
 
 def test_landmarks_with_ids_that_stand_in_one_place_determine_no_pose() -> None:

@@ -1,4 +1,4 @@
-"""Rays of a camera whose mount is in the map are started again while the mount leaves open how far the camera went."""
+"""Rays are started again where their depth is not linear, and while a mount leaves open how far its camera went."""
 
 from __future__ import annotations
 
@@ -50,3 +50,22 @@ def test_a_ray_whose_way_the_mount_leaves_open_is_started_again(sigma_m: float, 
         place = camera[:3] + matrix(camera[3:]) @ [0.3, 0, 0.2]
         np.testing.assert_allclose(slam.landmarks().means[0][:3], place, atol=1e-9)  # anchored where the camera is now
         np.testing.assert_allclose(slam.covariance("r.camera"), before.covariance("r.camera"), atol=1e-12)
+
+
+@pytest.mark.parametrize("lateral_m", [0.3, 0.5])
+def test_a_depth_that_a_robot_driving_towards_a_landmark_cannot_know_stays_open(lateral_m: float) -> None:
+    place, sigmas, worst = np.array([20.0, lateral_m]), np.array([0.01, 0.01, 0.002]), 0.0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        eye = km.Mount(km.sensors.Bearing(0.02))
+        slam = km.Slam(km.Robot("car", km.motion.Odometry2D(*sigmas), sensors={"eye": eye}))
+        for k in range(70):
+            if k:
+                slam.process(km.Control(0.1 * k, "car", [0.2, 0.0, 0.0] + sigmas * rng.normal(size=3)))
+            ahead = np.arctan2(lateral_m, 20.0 - 0.2 * k) + 0.02 * rng.normal()
+            slam.process(km.Scan(0.1 * k, "car", "eye", [[ahead]], [7]))
+        assert slam.landmark_model(7).kind == "inverse_depth_2d"
+        ray, P = slam.mean(7), slam.covariance(7)
+        off = ray[3] - 1.0 / np.linalg.norm(place - ray[:2])
+        worst = max(worst, abs(off) / np.sqrt(P[3, 3]))
+    assert worst < 3.0, "sigmas of the inverse depth"

@@ -12,8 +12,9 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam
 from kalmark.events import Event
-from kalmark.geometry import compose, inverse
+from kalmark.geometry import compose, frames3d, inverse
 from kalmark.geometry.angles import wrap
+from kalmark.geometry.rotations import exp
 from kalmark.results.batch import batch_input
 from kalmark.simulate import load_world, simulate
 
@@ -197,3 +198,47 @@ def test_a_lost_robot_goes_on_from_a_file_bit_for_bit(tmp_path: Any) -> None:
         other.process(event)
     np.testing.assert_array_equal(slam.mean("rover"), other.mean("rover"))
     assert len(slam.landmarks()) == len(other.landmarks())
+
+
+def test_a_robot_of_space_that_coasts_is_placed_once_with_another_velocity() -> None:
+    rng, start = np.random.default_rng(0), np.array([2.0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5), 0, 0.8, 0, 0, 0, 0.4])
+    stones = rng.uniform(-4.0, 4.0, (16, 3))
+    sonar = km.Mount(km.sensors.RangeBearing3D(0.05, 0.02, 0.02))
+    motion = km.motion.ConstantVelocity3D(sigma_v_mps_per_sqrt_s=0.01, sigma_w_radps_per_sqrt_s=0.01)
+    slam = km.Slam(km.Robot("diver", motion, start, {"sonar": sonar}, cov=1e-4 * np.eye(12)))
+    for k, place in enumerate(stones):
+        slam.add_landmark(k, place)
+    truth, gaps, off = start.copy(), [], []
+    for k in range(60):
+        if k == 30:  # carried to where it was at first, upside down, and turning the other way
+            truth = np.array([2.0, 0, 0, 1.0, 0, 0, 0, 0.6, -0.5, 0.0, 0, 0, -0.4])
+        truth = motion.move(truth, np.zeros(6), 0.1)[0] if k else truth
+        y = sonar.sensor.expect(frames3d.to_frame(truth[:7], stones)[0])[0]
+        y += rng.normal(0.0, (0.05, 0.02, 0.02), y.shape)
+        gaps += slam.process(km.Scan(0.1 * k, "diver", "sonar", y, range(len(y)))).gaps
+        off.append(np.linalg.norm(frames3d.minus(slam.mean("diver")[:7], truth[:7])))
+    assert [gap.kind for gap in gaps] == ["elsewhere"]
+    assert max(off[32:]) < 0.15
+    error = motion.space.minus(slam.mean("diver"), truth)
+    assert error @ np.linalg.solve(slam.covariance("diver"), error) < 32.9, ".999 of chi-square of 12"
+
+
+@pytest.mark.parametrize("height_m", [4.0, 0.0])
+def test_a_robot_of_space_is_found_by_ranges_to_beacons_at_a_ceiling_too(height_m: float) -> None:
+    rng, truth = np.random.default_rng(1), np.array([2.0, 1.0, 0.5, 0, 0, 0, 1.0])
+    beacons = np.column_stack([rng.uniform(-6.0, 6.0, (8, 2)), 3.0 + height_m * rng.random(8)])
+    sonar = km.Mount(km.sensors.Range3D(sigma_range_m=0.05))
+    slam = km.Slam(km.Robot("diver", km.motion.Odometry3D(0.02, 0.02, 0.02, 0.01), truth, {"sonar": sonar}))
+    for k, place in enumerate(beacons):
+        slam.add_landmark(k, place)
+    step, gaps, off = np.array([0.1, 0, 0, 0, 0, 0.05]), [], []
+    for k in range(40):
+        if k == 20:  # carried below, and turned by a third of a turn
+            truth = np.array([-3.0, -2.0, -1.0, 0, 0, np.sin(np.pi / 3), np.cos(np.pi / 3)])
+        truth = frames3d.compose(truth, np.array([0.1, 0, 0, *exp(step[3:])]))[0]
+        slam.process(km.Control(0.1 * k, "diver", step))
+        y = np.linalg.norm(beacons - truth[:3], axis=1) + rng.normal(0.0, 0.05, 8)
+        gaps += slam.process(km.Scan(0.1 * k, "diver", "sonar", y[:, None], range(8))).gaps
+        off.append(np.linalg.norm(slam.mean("diver")[:3] - truth[:3]))
+    assert [gap.kind for gap in gaps] == ["elsewhere"]
+    assert max(off[21:]) < 0.3

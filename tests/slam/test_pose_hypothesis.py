@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ import pytest
 import kalmark as km
 from kalmark.arrays import Array
 from kalmark.geometry.frames import compose
+from kalmark.geometry.rotations import exp, matrix
+from kalmark.geometry.spaces import SE3
 from kalmark.report import Report
+from kalmark.slam.pose_hypothesis import write_robot
 
 RTK_M, STEP_S = 0.014, 0.2
 UNIT_S, RECEIVER_M = 0.01, 0.1
@@ -144,3 +148,28 @@ def test_of_two_robots_only_the_one_that_was_carried_away_is_moved(map_: str) ->
     for name, x in truth.items():
         error = slam.robots[name].motion.space.minus(slam.mean(name), x)
         assert error @ np.linalg.solve(slam.covariance(name), error) < 16.3
+
+
+@pytest.mark.parametrize("motion", [km.motion.ConstantVelocity3D(), km.motion.InertialGravity()])
+def test_a_robot_that_is_placed_keeps_its_velocity_in_its_own_frame(motion: Any) -> None:
+    rng, space = np.random.default_rng(0), motion.space
+    start, placed = np.zeros(space.size), np.array([4.0, 5.0, 6.0, *exp(np.array([0.2, -0.4, 1.9]))])
+    start[6], start[7:] = 1.0, 0.1 + rng.random(space.size - 7)
+    A = 0.01 * rng.normal(size=(space.dof, space.dof))
+    slam = km.Slam(km.Robot("r", motion, start, cov=A @ A.T))
+    moving, map_, cov = slam.state.moving["r"], slam.state.map, 0.01**2 * np.eye(6)
+    moving.fastest = 0.3, 0.2
+    before, errors = moving.velocity(start)[0], rng.normal(size=(4000, space.dof)) @ A.T
+    write_robot(map_, moving, placed, cov)
+    after = map_.mean(moving.slot)
+    np.testing.assert_allclose(moving.velocity(after)[0], before, atol=1e-12)
+    np.testing.assert_array_equal(after[10 if len(before) == 3 else 13 :], start[10 if len(before) == 3 else 13 :])
+
+    def drawn(error: Array) -> Array:
+        """Return the velocity after the placement (3,) in the world, of a robot with an error before it."""
+        turned = SE3.plus(placed, 0.01 * rng.normal(size=6))
+        own = moving.velocity(space.plus(start, error))[0][:3] + 0.3 * rng.normal(size=3)
+        return matrix(turned[3:]) @ own
+
+    spread = np.cov([drawn(error) for error in errors], rowvar=False)
+    np.testing.assert_allclose(map_.covariance([moving.slot])[6:9, 6:9], spread, atol=0.008)

@@ -24,10 +24,12 @@ from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.tracks.known_landmarks import Known
+from kalmark.tracks.scan import FEWEST_RANGES
 
 FEWEST = 3  # pairs without ids
 FEWEST_NAMED = {2: 2, 3: 3}  # with ids, by the dimensions of the world
 FEWEST_RAYS = {2: 3, 3: 6}  # directions with ids
+ANY_RAD = math.pi / math.sqrt(3.0)  # sigma of an attitude that may be any, on each axis
 STEPS = 5  # of least squares
 LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
 SURE = 7.0  # the most that one landmark counts: log odds
@@ -90,6 +92,14 @@ def locate_rays(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> 
     return _by_ids(of, rows_of(of, ids), FEWEST_RAYS[d], _Rays(v, sigma * math.sqrt(d / (d - 1))))
 
 
+def locate_ranges(of: Known, ids: Sequence[Id | None], T: Array, r: Array, sigma: Array) -> Proposal | str:
+    """Return the place that distances r (K,) with these ids and sigmas (K,) determine, as a pose, or why they do not.
+
+    Of the attitude, that of T (7,), nothing is known.
+    """
+    return _by_ids(of, rows_of(of, ids), FEWEST_RANGES, _Ranges(T, r, sigma))
+
+
 class _Points(NamedTuple):
     """Points v (K, d) in the frame of a sensor, with their sigmas (K,)."""
 
@@ -148,13 +158,64 @@ class _Rays(NamedTuple):
         return np.linalg.inv(np.einsum("kai,k,kaj->ij", J, (LOOSE * self.sigma[some]) ** -2, J))
 
 
+class _Ranges(NamedTuple):
+    """Distances r (K,) of a sensor of space with the attitude of T (7,), with their sigmas (K,)."""
+
+    T: Array
+    r: Array
+    sigma: Array
+
+    def solve(self, l: Array, some: Index) -> Array:
+        """Return the pose from which some of the landmarks l (K, 3) are so far.
+
+        With p from the middle m of the landmarks, 2 (l - m)'p = |l - m|^2 - r^2 + |p|^2: their differences determine p,
+        but across landmarks in a plane.  The search begins on both sides of it.  Where neither is likelier by `SURE`, it
+        is that of T: few robots are carried through a ceiling, or out of the water.
+        """
+        l, r = l[some], self.r[some]
+        m = l.mean(axis=0)
+        A, b = l - m, np.sum((l - m) ** 2, axis=1) - r**2
+        U, s, Vt = np.linalg.svd(A, full_matrices=False)
+        if not s[1] > 0.0:
+            raise np.linalg.LinAlgError("they are on a line")
+        flat = Vt[:2].T @ ((U.T @ (b - b.mean()))[:2] / (2.0 * s[:2]))
+        height = math.sqrt(max(float(-b.mean() - flat @ flat), 0.0))
+        found = [self._refined(m + flat + side * height * Vt[2], l, r, some) for side in (1.0, -1.0)]
+        (best, least), (other, cost) = sorted(found, key=lambda one: one[1])
+        if cost - least < 2.0 * SURE and (other - m) @ Vt[2] * ((self.T[:3] - m) @ Vt[2]) > 0.0:
+            best = other
+        return np.append(best, self.T[3:])
+
+    def _refined(self, p: Array, l: Array, r: Array, some: Index) -> tuple[Array, float]:
+        """Return the place (3,) of least squares from p on, and its chi-square."""
+        weights = 1.0 / (LOOSE * self.sigma[some])
+        for _ in range(4 * STEPS):
+            v = p - l
+            d = np.linalg.norm(v, axis=1) + 1e-300
+            p = p + np.linalg.lstsq(v / d[:, None] * weights[:, None], (r - d) * weights)[0]
+        return p, float(np.sum(((r - np.linalg.norm(p - l, axis=1)) * weights) ** 2))
+
+    def misfits(self, T: Array, l: Array, some: Index) -> Array:
+        """Return the squared errors, in sigmas, over their gate."""
+        off = (np.linalg.norm(l[some] - T[:3], axis=1) - self.r[some]) / (LOOSE * self.sigma[some])
+        return np.asarray(off**2 / chi2_gate(REACH, 1))
+
+    def covariance(self, T: Array, l: Array, some: Index) -> Array:
+        """Return the covariance of the pose."""
+        v = T[:3] - l[some]
+        J = v / (np.linalg.norm(v, axis=1) * LOOSE * self.sigma[some])[:, None]
+        cov = ANY_RAD**2 * np.eye(6)
+        cov[:3, :3] = np.linalg.inv(J.T @ J)
+        return cov
+
+
 def rows_of(of: Known, ids: Sequence[Id | None]) -> Index:
     """Return the rows (K,) of landmarks with these ids, -1 where there is none."""
     at = {name: row for row, name in enumerate(of.names)}
     return np.array([-1 if name is None else at.get(name, -1) for name in ids], dtype=np.int64)
 
 
-def _by_ids(of: Known, rows: Index, fewest: int, seen: _Points | _Rays) -> Proposal | str:
+def _by_ids(of: Known, rows: Index, fewest: int, seen: _Points | _Rays | _Ranges) -> Proposal | str:
     """Return the pose with which all observations of landmarks `rows` (K,) agree; so few of them determine one."""
     some = np.flatnonzero(rows >= 0)
     if len(some) < fewest:

@@ -1,9 +1,14 @@
-"""Rays of a camera whose mount is in the map: which are started again, in place of a depth that the mount leaves open.
+"""Rays that are started again where they are seen: in place of a correction that would take a depth from noise.
 
-A ray is seen along h - rho t, t the way from its anchor to the camera.  Where the camera turns about its robot, the
-lever arm of the mount is a part of t.  While rho is open, too, images measure the product of two unknowns: their
-likelihood of the mount then is far from Gaussian, with its rotation it can have two maxima, and no later image repairs
-a correction towards the wrong one.  docs/bearing_only.md.
+A ray is seen along v = h - rho t, t the way from its anchor to the sensor.
+
+*Straight ahead or behind* v, h and t are parallel, and no measurement determines rho.  The estimate of v is off by
+noise, and at that estimate the Jacobian finds a depth, in each scan a little more.  So a ray is started again where
+rho, with what the measurement adds beyond such noise, still leaves the length of v open: there no linearisation holds.
+
+*A mount in the map* whose camera turns about its robot has its lever arm in t.  While rho is open, too, images measure
+the product of two unknowns: their likelihood of the mount then is far from Gaussian, with its rotation it can have two
+maxima, and no later image repairs a correction towards the wrong one.  docs/bearing_only.md.
 """
 
 from __future__ import annotations
@@ -14,10 +19,33 @@ from kalmark.arrays import Flags, Index
 from kalmark.geometry.rotations import skew
 from kalmark.models.landmarks import AnchoredHomogeneous
 from kalmark.models.observe import linearize
+from kalmark.models.protocols import Reparametrizable
+from kalmark.tracks import linearity
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 
 SHARE = 0.05  # of the way from its anchor that a mount may leave open
+
+
+def bent_rays(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:
+    """Return which observations `rows` (K,), of the blocks `slots`, are of rays along which no linearisation holds.
+
+    With what they add to it, sigma of rho still lets the length of v = h - rho t change by more than a `SHARE`.  They
+    add |R^-1/2 E_rho|^2, less what E_rho would be of a ray in the direction of t that is off by their noise, |t| / |v|.
+    """
+    if not isinstance(model.landmark, Reparametrizable):
+        return np.zeros(len(rows), dtype=np.bool_)
+    map_, d, R = scan.map, scan.dimensions, scan.noise(model, slots, rows)
+    l = map_.means(slots, model.d)
+    v, _, V_l = model.landmark.seen_from(scan.pose(), l)
+    v, t = v[:, :d], V_l[:, :d, -1]
+    E_rho = linearize(model.model, scan.channel.head(map_, scan.robot), l, scan.y[rows])[3][:, :, -1]
+    slope = np.sqrt(np.sum(E_rho * np.linalg.solve(R, E_rho[..., None])[..., 0], axis=1))
+    by_noise = np.linalg.norm(t, axis=1) / np.linalg.norm(v, axis=1)
+    variance = np.array([map_.covariance([slot])[-1, -1] for slot in slots.tolist()])
+    left = variance / (1.0 + variance * np.maximum(slope - linearity.SIGMAS * by_noise, 0.0) ** 2)
+    change = linearity.SIGMAS * np.sqrt(left) * np.abs(np.sum(v * t, axis=1))
+    return np.asarray(change > linearity.SHARE * np.sum(v * v, axis=1))
 
 
 def rays_without_baseline(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:

@@ -58,7 +58,7 @@ class Trilateration:
         if pending.channel != scan.key:
             return Step("ignored", OTHERS)
         if not pending.measurements:
-            return Step("deferred", "", replace(pending, spacing_m=_sigma(scan, k)), keep=True)
+            return Step("deferred", "", replace(pending, spacing_m=float(scan.distances()[1][k])), keep=True)
         last = scan.channel.pose(scan.map, scan.clones[pending.measurements[-1].clone])[:2]
         if np.linalg.norm(scan.pose()[:2] - last) < pending.spacing_m:
             return Step("deferred", f"within {pending.spacing_m:.2f} m of where the last range kept was taken")
@@ -108,14 +108,6 @@ class Trilateration:
         H_x = np.einsum("iw,iwx->ix", best.H_w, problem.S_x)
         start = Start(POINT2, best.l, parts, -W @ H_x, (W * best.R) @ W.T)
         return Step("new", f"from {len(kept)} ranges", start=start, measurements=len(kept))
-
-
-def _sigma(scan: ScanContext, k: int) -> float:
-    """Return how uncertain the distance is, m, that a measurement stands for."""
-    sensor = scan.channel.calibrated(scan.map)
-    distance = max(float(sensor.distances(scan.y[k : k + 1])[0]), 1e-3)
-    slope = float(np.linalg.norm(sensor.expect(np.array([[distance, 0.0]]))[1]))
-    return math.sqrt(scan.R[k, 0, 0]) / slope
 
 
 def _varies(scan: ScanContext, m: Measurement) -> bool:

@@ -497,9 +497,14 @@ class Distant(Capability, Protocol):
         """Return the distances (K,) in m of measurements y (K, m); in the plane, those along the plane."""
 
 
+def gives_distances(sensor: Sensor) -> bool:
+    """Return whether a sensor measures one number alone that determines a distance: range, strength."""
+    return len(sensor.columns) == 1 and isinstance(sensor, Distant)
+
+
 def distances_alone(sensor: Sensor) -> bool:
-    """Return whether a sensor measures one number alone that determines a distance in the plane: range, strength."""
-    return len(sensor.columns) == 1 and isinstance(sensor, Distant) and world_of(sensor) != "space"
+    """Return whether a sensor measures one number alone that determines a distance in the plane."""
+    return gives_distances(sensor) and world_of(sensor) != "space"
 
 
 @runtime_checkable

@@ -17,7 +17,16 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags
-from kalmark.association.global_start import LOOSE, SURE, Proposal, locate_points, locate_rays, locate_tags, rows_of
+from kalmark.association.global_start import (
+    LOOSE,
+    SURE,
+    Proposal,
+    locate_points,
+    locate_ranges,
+    locate_rays,
+    locate_tags,
+    rows_of,
+)
 from kalmark.association.relocalization import is_same_pose
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
@@ -200,6 +209,8 @@ def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Propos
     if scan.channel.landmark.kind == "tag":
         v, V = scan.channel.calibrated(scan.map).invert(scan.y)
         found = locate_tags(old, scan.ids, v, V @ scan.R @ V.swapaxes(1, 2))
+    elif scan.channel.gives_distances:
+        found = locate_ranges(old, scan.ids, scan.pose(), *scan.distances())
     elif scan.channel.gives_rays:
         found = locate_rays(old, scan.ids, *scan.places())
     else:
@@ -217,7 +228,7 @@ def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     )
     of_world = FRAMES[len(scan.channel.at)]
     to_robot = of_world.compose(of_world.inverse(scan.pose())[0], r[: len(found.T)])[0]
-    write_robot(other.map, scan.robot, of_world.compose(found.T, to_robot)[0], found.cov)
+    write_robot(other.map, other.moving, of_world.compose(found.T, to_robot)[0], found.cov)
     of.gain, of.fitted = found.gain, {old.names[row] for row in found.matched if row >= 0}
 
 

@@ -123,7 +123,7 @@ class GaussianSum:
         """Return the sum of a robot that may be elsewhere than the map has it: without a part yet, and unlikely."""
         prior = PoseHypothesis.of(map_, moving, blocks, t_ns)
         pose, sigmas = prior.map.mean(moving.slot)[:3], np.array([ANYWHERE_M, ANYWHERE_M, VAGUE_RAD])
-        write_robot(prior.map, moving.slot, pose, np.diag(sigmas**2))
+        write_robot(prior.map, moving, pose, np.diag(sigmas**2))
         return cls(prior, as_part(prior.map, 0.0).take(slice(0)), 0.0, 0.5 * IN_A_ROW * gate)
 
     def restored(self) -> None:

@@ -28,12 +28,15 @@ from kalmark.filter.map import Map
 from kalmark.geometry.spaces import Rn, Space
 from kalmark.models.observe import step, step_of
 from kalmark.models.protocols import (
+    HoldsRate,
     Motion,
     SelfCalibrating,
     StateDiffusion,
     coasts,
     self_calibrating,
+    tells_velocity,
     true_control,
+    velocity_in,
 )
 from kalmark.report import Gap
 from kalmark.slam.gaps import Gaps
@@ -253,6 +256,7 @@ class Moving:
     `bias` and `error` are the slots of the constants of its controls and of the error that parts of a control share,
     None where there is none.
     `left_out` are the last fixes, if they were outside the gate.  `past` are its last motions, where a sensor lags.
+    `fastest` are the greatest speed and turn rate, m/s and rad/s, that a state with a velocity has had.
     """
 
     motion: Motion
@@ -262,12 +266,33 @@ class Moving:
     error: int | None = None
     left_out: list[RejectedFix] = field(default_factory=list)
     past: PastMotion | None = None
-    SAVED: ClassVar = ("slot", "bias", "held", "error", "left_out", "past")
+    fastest: tuple[float, float] = 0.0, 0.0
+    SAVED: ClassVar = ("slot", "bias", "held", "error", "left_out", "past", "fastest")
 
     @cached_property
     def moves_itself(self) -> bool:
         """True if its diffusion depends on its state."""
         return isinstance(self.motion, StateDiffusion)
+
+    @cached_property
+    def has_velocity(self) -> bool:
+        """True if the velocity of the robot is in its state."""
+        return tells_velocity(self.motion)
+
+    def velocity(self, r: Array) -> tuple[Array, Array]:
+        """Return the velocity b of a state r (size,) in the frame of the robot, (3 or 6,), and its Jacobian.
+
+        Of an inertial unit it is (3,), without the turn rate, which is that of its control.
+        """
+        b, B = velocity_in(self.motion, r, np.zeros(len(self.motion.columns)))
+        return (b[: len(b) // 2], B[: len(b) // 2]) if isinstance(self.motion, HoldsRate) else (b, B)
+
+    def note_speed(self, map_: Map) -> None:
+        """Take note of how fast it is."""
+        b = self.velocity(map_.mean(self.slot))[0]
+        d = 2 if self.motion.space.axes == 1 else 3
+        speeds = math.hypot(*b[:d].tolist()), math.hypot(*b[d:].tolist())
+        self.fastest = max(self.fastest[0], speeds[0]), max(self.fastest[1], speeds[1])
 
     @cached_property
     def model(self) -> Any:

@@ -258,9 +258,10 @@ def note_adrift(state: State, scan: ScanContext) -> None:
 
 def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:
     """Put a robot of space where its sensor is at T (7,), with the covariance (6, 6), wherever it was."""
-    slot = state.moving[name].slot
-    to_robot = frames3d.compose(frames3d.inverse(channel.pose(state.map, slot))[0], state.map.mean(slot)[:7])[0]
-    write_robot(state.map, slot, frames3d.compose(T, to_robot)[0], cov)
+    moving = state.moving[name]
+    r = state.map.mean(moving.slot)[:7]
+    to_robot = frames3d.compose(frames3d.inverse(channel.pose(state.map, moving.slot))[0], r)[0]
+    write_robot(state.map, moving, frames3d.compose(T, to_robot)[0], cov)
     state.clones.forget_current(name)
 
 

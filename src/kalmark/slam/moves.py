@@ -66,6 +66,8 @@ def move(state: State, name: str, part: MotionPart) -> None:
     before = state.pose(name) if moving.past is not None else None
     if not estimator.predict(state.map, moving.movement(state.map, part)):
         raise _nowhere(state, name, part)
+    if moving.has_velocity:
+        moving.note_speed(state.map)
     if moving.past is not None and before is not None and part.dt_s > 0.0:
         moving.past.add(part.dt_s, twist_between(before, state.pose(name), part.dt_s))
     for key, given in state.given.items():

@@ -19,7 +19,7 @@ from kalmark.management.hypotheses import Hypotheses
 from kalmark.management.pending import Initialization
 from kalmark.management.trilateration import Trilateration
 from kalmark.management.upkeep import Upkeep
-from kalmark.models.landmarks import AnchoredHomogeneous, AsPoint
+from kalmark.models.landmarks import AsPoint
 from kalmark.models.protocols import (
     Ambiguous,
     Intersecting,
@@ -96,7 +96,7 @@ def policy_of(
         _starts(association, upkeep), averages(association), upkeep.hold_back and not weighs(association), reviews,
         0.0 if channel.joins else linear or 0.0,
         upkeep.keep_poses if delayed is None and not (channel.sees_velocity or channel.lags) else 0,
-        not channel.finds_depth and channel.mount >= 0 and any(isinstance(kind, AnchoredHomogeneous) for kind in seen),
+        not channel.finds_depth and any(isinstance(kind, Reparametrizable) for kind in seen),
         (channel.robust is not None or association.threshold(channel.dof, 0.0) < math.inf)
         and delayed is None and (deferred is None or channel.is_ambiguous) and channel.starts_landmarks,
         WIDER**2 * gate(SURVEYED, channel.dof)

@@ -91,7 +91,23 @@ def motion_of_hypothesis(moving: Moving) -> Moving:
     return replace(moving, error=None, left_out=[])
 
 
-def write_robot(map_: Map, slot: int, mean: Array, cov: Array) -> None:
-    """Write the first numbers of a robot's block, and the covariance (d, d) of these, independent of all else."""
-    map_.predict(map_.index(slot)[: len(cov)], np.zeros_like(cov), cov)
-    map_.set_predicted(slot, np.concatenate([mean, map_.mean(slot)[len(mean) :]]))
+def write_robot(map_: Map, moving: Moving, mean: Array, cov: Array) -> None:
+    """Write the first numbers of a robot's state, and the covariance (d, d) of these, independent of all else.
+
+    A velocity in the rest of the state stays what it is in the frame of the robot: it turns with its pose.  As a robot
+    that was carried away may have another one, it is less certain by the greatest so far.
+    """
+    x, rows, d = map_.mean(moving.slot), map_.index(moving.slot), len(cov)
+    after, F = np.concatenate([mean, x[len(mean) :]]), np.eye(len(rows))
+    G = np.eye(len(rows), d)  # of the errors of `mean`
+    Q, F[:d] = np.zeros_like(F), 0.0
+    if moving.has_velocity and d < len(rows):
+        (b, B), (now, B_now) = moving.velocity(x), moving.velocity(after)
+        back = np.linalg.pinv(B_now[:, d:])
+        after = moving.motion.space.plus(after, np.concatenate([np.zeros(d), back @ (b - now)]))
+        F[d:] += back @ (B - np.hstack([np.zeros((len(b), d)), B_now[:, d:]]))
+        G[d:] = -back @ B_now[:, :d]
+        speeds = np.repeat(moving.fastest, [d - d // 2, d // 2])[: len(b)]
+        Q[d:, d:] = (back * speeds**2) @ back.T
+    map_.predict(rows, F, G @ cov @ G.T + Q)
+    map_.set_predicted(moving.slot, after)

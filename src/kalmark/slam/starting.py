@@ -22,7 +22,7 @@ from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Pending, Status, Track
 
 UNEXPLAINED = "no landmark explains this measurement"
-AGAIN = "started again: its mount leaves open from where it was seen before"
+AGAIN = "started again: from where it was seen before its depth stays open"
 SINGULAR = "what it may be cannot be computed: a matrix is singular"
 
 
@@ -75,17 +75,14 @@ def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name:
 def take_open_rays(
     state: State, scan: ScanContext, groups: list[tuple[ObservationModel, list[int]]], decisions: Sequence[Decision]
 ) -> list[int]:  # fmt: skip
-    """Return the observations of rays whose depth a mount leaves open, and take them out of the groups to be fused."""
+    """Return the observations of rays whose depth stays open, and take them out of the groups to be fused."""
     found: list[int] = []
     for model, rows in groups:
         slots = state.tracks.slots_of([decisions[k][0] for k in rows])
-        found += [
-            k
-            for k, is_open in zip(
-                rows, ray_restarts.rays_without_baseline(scan, model, slots, rows).tolist(), strict=True
-            )
-            if is_open
-        ]
+        is_open = ray_restarts.bent_rays(scan, model, slots, rows)
+        if scan.channel.mount >= 0:
+            is_open |= ray_restarts.rays_without_baseline(scan, model, slots, rows)
+        found += [k for k, is_one in zip(rows, is_open.tolist(), strict=True) if is_one]
         rows[:] = [k for k in rows if k not in found]
     return found
 

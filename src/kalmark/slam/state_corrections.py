@@ -138,9 +138,9 @@ def _record_position(state: State, name: str, y: Array, R: Array, done: Correcti
         if len(state.robots) == 1 and all(relocation_by_fixes.can_move(space) for _, space in blocks):
             _move(state, blocks, found.shift)
         else:
-            write_robot(state.map, moving.slot, found.pose, found.cov)
+            write_robot(state.map, moving, found.pose, found.cov)
     elif other is not None and fits and other.explains(state.t_ns):
-        write_robot(state.map, moving.slot, other.map.mean(moving.slot), other.map.covariance([moving.slot]))
+        write_robot(state.map, moving, other.map.mean(moving.slot), other.map.covariance([moving.slot]))
     else:
         _doubt(state, name, found, done, R, fits)
         return 0.0
@@ -168,7 +168,7 @@ def _doubt(
     if found is None:
         other.widen(done.z[0], done.Z[0], R)
     else:
-        write_robot(other.map, other.moving.slot, found.pose, found.cov)
+        write_robot(other.map, other.moving, found.pose, found.cov)
 
 
 def _blocks(state: State) -> list[tuple[int, Space]]:

@@ -153,12 +153,13 @@ class Channel:
         self.starts_landmarks = full and any_depth
         placed = all(has_place(model.landmark.space) for model in self.models.values())
         self.gives_places = full and self.finds_depth and placed
-        points = any(kind in EUCLIDEAN for kind in self.kinds) and not protocols.distances_alone(sensor)
+        self.gives_distances = protocols.gives_distances(sensor)
+        points = any(kind in EUCLIDEAN for kind in self.kinds) and not self.gives_distances
         self.gives_rays = full and points and not (self.finds_depth or self.sees_velocity)
         kind, flat = landmark.kind, self.dimensions == 2
         self.locates = self.gives_places and flat and not self.joins and kind == "point"
-        by_points = self.gives_places and not flat and kind in ("point3", "tag")
-        self.locates_by_ids = self.locates or self.gives_rays or by_points
+        of_space = not flat and (self.gives_distances or (self.gives_places and kind in ("point3", "tag")))
+        self.locates_by_ids = self.locates or self.gives_rays or of_space
         self.has_limits, self.fov_rad = isinstance(sensor, protocols.Visible), protocols.field_of_view(sensor)
         segmented = (kind for kind, model in self.models.items() if isinstance(model.landmark, protocols.Segmented))
         self.points = self.kinds - {*segmented}  # kinds of landmarks that are no lines

@@ -19,6 +19,8 @@ from kalmark.tracks.classes import add_report
 from kalmark.tracks.clones import Clones, Measurement
 from kalmark.tracks.track import ChannelKey, Tracks
 
+FEWEST_RANGES = 4  # distances of space by which a place is one
+
 
 class Start(NamedTuple):
     """A block to be added to the map, computed from blocks that are in it: mean, covariance G P G' + Q.  [S] (35)-(38).
@@ -96,8 +98,9 @@ class ScanContext:
     @property
     def locates(self) -> bool:
         """True if the scan determines where its robot is."""
-        ids = self.event.ids
-        return self.channel.locates or (self.channel.locates_by_ids and ids is not None and None not in ids)
+        ids, channel = self.event.ids, self.channel
+        enough = not channel.gives_distances or len(self.y) >= FEWEST_RANGES
+        return channel.locates or (channel.locates_by_ids and enough and ids is not None and None not in ids)
 
     @property
     def noise_varies(self) -> bool:
@@ -112,6 +115,15 @@ class ScanContext:
     def pose(self) -> Array:
         """Return the pose of the sensor as it is estimated now, (3,) or (7,)."""
         return self.channel.pose(self.map, self.robot)
+
+    def distances(self) -> tuple[Array, Array]:
+        """Return the distances (K,) that observations of a sensor stand for, and their sigmas (K,)."""
+        sensor = self.channel.calibrated(self.map)
+        r = np.maximum(sensor.distances(self.y), 1e-3)
+        ahead = np.zeros((len(r), self.dimensions))
+        ahead[:, 0] = r
+        slopes = np.linalg.norm(sensor.expect(ahead)[1][:, 0], axis=1)
+        return r, np.sqrt(self.R[:, 0, 0]) / slopes
 
     def places(self) -> tuple[Array, Array]:
         """Return where observations are from a sensor that gives places (K, 2 or 3), and their sigmas (K,)."""
