@@ -22,7 +22,6 @@ from kalmark.diagnosis.trials import (
     MOST,
     SURELY,
     Fit,
-    Trials,
     filter_events,
     first_events,
     first_of,
@@ -30,19 +29,18 @@ from kalmark.diagnosis.trials import (
     fit_with,
     likelihood_gain,
     log_from,
+    race,
 )
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry.frames3d import to_euler_pose
 from kalmark.logs.log import Log
-from kalmark.logs.progress import track
 from kalmark.results.figure_texts import figure
 from kalmark.results.history import RobotStart
 from kalmark.results.measures import Rigid, level, level_sigmas, rmse
 from kalmark.results.run import Run
 from kalmark.results.wrong_starts import restarts
 
-FEW_SCANS = 20, 80  # at first: of most mistakes a log shows soon that they were not made
-LIKELIEST = 5  # kinds of mistakes by the first scans, that are tried in more
+LEAST_SCANS = 80  # and controls, that show by how much scans are late
 MUCH = 3.0  # times better is the log without the mistake
 LEAST_FIXES = 5  # in a row that do not fit: their robot is not where it should be
 WINDOW = 30  # observations, over which is asked whether the log fits from there on
@@ -60,50 +58,46 @@ def gross(run: Run, log: Log, alarmed: bool = False, progress: bool = False) -> 
     if found is not None:
         return found, None
     now = fit_of_run(run)
-    first, fits = misfits_from(now), now.mean < MISFIT and not run.stopped
     of_ids = find_wrong_ids(run, log, now)
-    alone = None if fits and not alarmed else likeliest(run, log, first_events(run, log), run.config, progress)
-    if alone is not None and of_ids is not None:  # it was found in the first events: of all it is compared
-        alone = alone._replace(gain=likelihood_gain(now, fit_with(log, log.events, alone)))
     explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
-    if alone is None and first is not None and not explained:
-        alone = find_later_mistake(run, log, first)
+    first = None if explained else misfits_from(now)
+    fits = now.mean < MISFIT and not run.stopped and first is None
+    alone = None if fits and not alarmed else likeliest(run, log, first, progress)
+    if alone is not None and of_ids is not None and first is None:  # found in the first events, compared in all
+        alone = alone._replace(gain=likelihood_gain(now, fit_with(log, log.events, alone)))
     if alone is None or (of_ids is not None and alone.gain < of_ids[0].gain):
         return of_ids
     return alone, None
 
 
-def likeliest(
-    run: Run, log: Log, events: list[Event], config: Mapping[str, Any], progress: bool = False
-) -> Mistake | None:
-    """Return the mistake without which events are likeliest, None if they fit as they are or without none.
+def likeliest(run: Run, log: Log, first: int | None = None, progress: bool = False) -> Mistake | None:
+    """Return the mistake without which a log is likeliest, None if it fits as it is or without none.
 
-    None, either, if they are likelier where what is far off is left out: no mistake is then why it is.
+    The log is filtered from the observation `first` on, if it fits before it: then a sensor was turned, or a source
+    exchanged.  None, too, if the log is likelier where what is far off is left out: no mistake is then why it is.
     """
-    changes = [*mistakes(config, run)]
-    if (run.history.id == "").any():  # else what is left of the data shows it
-        changes += [late for name in run.history.robots for late in late_or_early(config, events, name)]
-    for scans in FEW_SCANS:
-        few = Trials(log, first_events(run, events, scans), config)
-        tried = track(changes, f"mistakes in {scans} scans, one after the other", show=progress)
-        changes = [one for one in map(few.with_gain, tried) if one.gain >= -SURELY]
-    every = Trials(log, events, config)
-    tried = track(as_likely_as_a_few_kinds(changes), "the likeliest mistakes, one after the other", show=progress)
-    made = [one for change in tried for one in every.explain(change)]
-    ordered = sorted(reversed(made), key=lambda one: one.gain)
-    sizes = {(one.name, one.of): one for one in ordered}  # the likeliest of each error, the first of equal ones
-    made = [one for one in made if not one.of or one is sizes[one.name, one.of]]
-    off = [*every.explain(Mistake(OUTLIERS, "", "", gated(config)))] if made else []
-    return first_of([one for one in made if all(one.gain > other.gain for other in off)])
+    config, rest = (run.config, log) if first is None else log_from(run, log, first)
+    events = first_events(run, rest.events)
+    none, off = Mistake("", "", "", config), Mistake(OUTLIERS, "", "", gated(config))
+    made = race(rest, events, [none, off, *changes_of(run, config, events)], progress)
+    least = max((one.gain for one in made if one.name == OUTLIERS), default=0.0)
+    made = [one for one in made if one.gain > least]
+    sizes = {(one.name, one.of): one for one in sorted(reversed(made), key=lambda one: one.gain)}  # the likeliest
+    found = first_of([one for one in made if not one.of or one is sizes[one.name, one.of]])
+    if found is None or first is None:
+        return found
+    every = next(one for one in changes_of(run, run.config, events) if found.evidence.startswith(one.evidence))
+    before = [e for e in log.events if e.t_ns < events[0].t_ns]
+    as_it_is, changed = (fit_with(log, before, one) for one in (none._replace(config=run.config), every))
+    if likelihood_gain(as_it_is, changed) > -SURELY:
+        return every._replace(evidence=found.evidence, gain=found.gain, since_s=log.events[0].t_s)
+    return found._replace(evidence=f"from t={found.since_s:.1f} s on {found.evidence}", cure="", of=())
 
 
-def as_likely_as_a_few_kinds(changes: Sequence[Mistake]) -> list[Mistake]:
-    """Return the changes with a gain of the likeliest kinds; many sizes of one kind keep no other one out."""
-    best = dict[str, float]()
-    for one in changes:
-        best[one.name] = max(one.gain, best.get(one.name, -math.inf))
-    least = sorted(best.values())[-LIKELIEST] if len(best) > LIKELIEST else -math.inf
-    return [one for one in changes if one.gain >= least]
+def changes_of(run: Run, config: Mapping[str, Any], events: list[Event]) -> list[Mistake]:
+    """Return the mistakes that events may have, without ids those of time, too: else the residuals show these."""
+    late = run.history.robots if (run.history.id == "").any() else ()
+    return [*mistakes(config, run), *(one for robot in late for one in late_or_early(config, events, robot))]
 
 
 def late_or_early(config: Mapping[str, Any], events: list[Event], robot: str) -> Iterator[Mistake]:
@@ -112,22 +106,9 @@ def late_or_early(config: Mapping[str, Any], events: list[Event], robot: str) ->
     Where ids are unknown, the scans that show it most are of no landmark, and no residual is left of them.
     """
     mine = [[e.t_ns for e in events if isinstance(e, kind) and e.robot == robot] for kind in (Control, Scan)]
-    if min(map(len, mine)) >= FEW_SCANS[-1]:
+    if min(map(len, mine)) >= LEAST_SCANS:
         control_s, scan_s = (float(np.median(np.diff(t_ns))) * 1e-9 for t_ns in mine)
         yield from (late_scans(config, robot, k * max(control_s, 0.5 * scan_s)) for k in STEPS)
-
-
-def find_later_mistake(run: Run, log: Log, first: int) -> Mistake | None:
-    """Return the mistake from the observation `first` on: a sensor that was turned, a source that was exchanged.
-
-    The log is filtered again from there, from the robots' poses.
-    """
-    config, rest = log_from(run, log, first)
-    found = likeliest(run, rest, first_events(run, rest.events), config)
-    if found is None:
-        return None
-    evidence = f"from t={rest.events[0].t_s:.1f} s on {found.evidence}"
-    return found._replace(evidence=evidence, cure="", of=())
 
 
 def misfits_from(now: Fit) -> int | None:

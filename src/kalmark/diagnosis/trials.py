@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -25,10 +26,11 @@ from kalmark.errors import KalmarkError, LogError
 from kalmark.events import Event, Scan, sort_key
 from kalmark.logs.log import Log
 from kalmark.logs.log_corrections import correct_log
+from kalmark.logs.progress import track
 from kalmark.report import ALONE
 from kalmark.results.control_gaps import while_lost
 from kalmark.results.history import History, Ints
-from kalmark.results.record import record
+from kalmark.results.record import Recorder
 from kalmark.results.run import Run
 from kalmark.results.warnings import left_out_by_attention
 from kalmark.slam.held_readings import AGAIN
@@ -40,6 +42,7 @@ MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
 FITS = 2.0  # below which a log fits
 LOST = 9.0  # what an observation without an id counts that is of no landmark in the map: as one at the gate
 AT_ONCE = 20_000  # observations of a log that are filtered again, or solved for
+SHARES = tuple(1.5**-k for k in range(5, -1, -1))  # of the events, after which changes are compared
 MOST = 25.0  # that one observation counts, and what counts one that was left out
 ALIKE = 0.95  # of the gain of the likeliest change: the log does not distinguish them
 SURELY = 50.0  # the gain of what is 10 sigma off
@@ -64,6 +67,9 @@ class Fit(NamedTuple):
 
 
 REFUSED = Fit(np.zeros(0), np.zeros(0), np.zeros(0))
+UNUSED = Fit(
+    *np.outer((MOST, 1.0, -0.5 * MOST), np.ones(OBSERVATIONS))
+)  # a log that is refused, as another one with a change
 
 
 def fit_of_run(run: Run, shrunk: Mapping[tuple[str, str], float] | None = None) -> Fit:
@@ -107,34 +113,85 @@ def _likelihoods(h: History, dof: Ints, shrunk: Mapping[tuple[str, str], float])
     return np.maximum(fits, anywhere)
 
 
-class Trials:
-    """Events of a log under a configuration, filtered as they are and with changes, each once."""
+class Trial:
+    """Events of a log that are filtered with a change, part by part, and the fit of their observations so far."""
 
-    def __init__(self, log: Log, events: list[Event], config: Mapping[str, Any]) -> None:
-        self.log, self.events, self.config = log, events, config
-        self.as_it_is = self.with_change(Mistake("", "", "", config))
+    def __init__(self, log: Log, events: Iterable[Event], change: Mistake) -> None:
+        self.change, self.taken, self.fit = change, 0, REFUSED
+        self.events = sorted(map(change.change, events), key=sort_key) if change.change else [*events]
+        self.recorder: Recorder | None = None
+        with suppress(KalmarkError, np.linalg.LinAlgError):
+            part = replace(log, events=self.events)
+            slam = build_slam(config_of(Tree(deepcopy(dict(change.config))), None), part)
+            self.recorder = Recorder(slam, part, False, None)
 
-    def with_change(self, change: Mistake) -> Fit:
-        """Return the fit of the events with a change."""
-        return fit_with(self.log, self.events, change)
+    def run(self, share: float = 1.0) -> Run | None:
+        """Return the run of a share of the events, None if they are refused: then nothing fits."""
+        begin, self.taken, self.fit = self.taken, round(share * len(self.events)), REFUSED
+        with suppress(KalmarkError, np.linalg.LinAlgError):
+            if self.recorder is not None:
+                self.recorder.take(self.events[begin : self.taken], "skip")
+                run = self.recorder.run(0.0)
+                if not run.stopped and len(run.skipped) <= FEW_SKIPPED * len(self.events):
+                    self.fit = fit_of_run(run, self.change.shrunk)
+                    return run
+        self.recorder = None
+        return None
 
-    def with_gain(self, change: Mistake) -> Mistake:
-        """Return a change with its gain."""
-        return change._replace(gain=likelihood_gain(self.as_it_is, self.with_change(change)))
 
-    def explain(self, change: Mistake) -> Iterator[Mistake]:
-        """Yield a change with its gain, if the events fit with it, and are surely likelier."""
-        after = self.with_change(change)
-        gain = likelihood_gain(self.as_it_is, after)
-        if after.mean < FITS and gain > SURELY * max(after.mean, 1.0):
-            yield change._replace(gain=gain, since_s=self.events[0].t_s)
+def race(log: Log, events: list[Event], changes: Sequence[Mistake], progress: bool = False) -> list[Mistake]:
+    """Return the changes with which events fit, and are surely likelier than with the first of them, with their gains.
+
+    All are filtered at once, in growing parts of the events; what cannot win any more is dropped (`_in_race`).
+    """
+    none, *left = (Trial(log, events, change) for change in changes)
+    now = UNUSED if none.run() is None else none.fit
+    left = left if _misfit(now) > SURELY else []
+    for share in SHARES:
+        for one in track(left, f"mistakes in {share:.0%} of the first events", show=progress):
+            one.run(share)
+        left = [one for one in left if len(one.fit.values)]
+        left = [left[k] for k in _in_race(now, [one.fit for one in left], 1.0 / share - 1.0)]
+    made = [(one.change, likelihood_gain(now, one.fit)) for one in left]
+    return [change._replace(gain=gain, since_s=events[0].t_s) for change, gain in made]
+
+
+def _in_race(none: Fit, fits: Sequence[Fit], rest: float) -> Ints:
+    """Return the changes, by number, that may still fit and be about as likely as the likeliest, and surely than none.
+
+    The fits of changes are known so far, that of none to the end.  In the rest, which is `rest` times as long, a change
+    may fit, and be as likely as the likeliest of each half so far, where the likeliest of all goes on as it did.  It
+    gains no more than none misfits there, and of that no larger share than the best one did in the second half.
+    """
+    number = min(len(of.values) for of in (none, *fits))
+    if number < 2 or not fits:
+        return np.arange(len(fits))
+    halves = [0, number // 2]
+    likely = np.add.reduceat([of.likelihoods[:number] for of in (none, *fits)], halves, axis=1)
+    mean, total = np.array([of.values[:number].mean() for of in fits]), likely.sum(axis=1)
+    gain, won = (total - total[0])[1:], (likely - likely[0]).max(axis=0)[1]
+    least = ALIKE * gain.max() - rest * (likely.max(axis=0).sum() - total.max()) - (SURELY if rest else 0.0)
+    before, more = _misfit(none, number // 2, number), max(0.0, _misfit(none, number))
+    more *= min(1.0, won / before) if before > SURELY else 1.0
+    sure = gain + more > SURELY * np.clip(mean, 1.0, FITS)
+    return np.flatnonzero((mean + rest < FITS * (1.0 + rest)) & (gain >= least) & sure)
+
+
+def _misfit(of: Fit, begin: int = 0, end: int | None = None) -> float:
+    """Return by how much some observations are less likely than such that fit."""
+    return 0.5 * float(((of.values - 1.0) * of.dof)[begin:end].sum())
+
+
+def filter_events(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
+    """Return the run of events under a configuration, None if they are refused."""
+    return Trial(log, events, Mistake("", "", "", config)).run()
 
 
 def fit_with(log: Log, events: Iterable[Event], change: Mistake) -> Fit:
     """Return the fit of some events of a log with a change."""
-    changed = sorted(map(change.change, events), key=sort_key) if change.change else [*events]
-    run = filter_events(change.config, log, changed)
-    return REFUSED if run is None else fit_of_run(run, change.shrunk)
+    trial = Trial(log, events, change)
+    trial.run()
+    return trial.fit
 
 
 def first_of(made: Sequence[Mistake]) -> Mistake | None:
@@ -235,14 +292,3 @@ def is_configured(config: Mapping[str, Any], cure: str) -> bool:
 
 def _nested(names: Sequence[str], value: float) -> dict[str, Any]:
     return {names[0]: _nested(names[1:], value) if len(names) > 1 else value}
-
-
-def filter_events(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
-    """Return the run of events under a configuration, None if they are refused."""
-    try:
-        made = config_of(Tree(deepcopy(dict(config))), None)
-        part = replace(log, events=events)
-        run = record(build_slam(made, part), part, progress=False, on_error="skip", pictures=False)
-    except (KalmarkError, np.linalg.LinAlgError):
-        return None
-    return None if run.stopped or len(run.skipped) > FEW_SKIPPED * len(events) else run

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -91,24 +91,10 @@ def record(
     if on_error not in ("raise", "skip"):
         raise ValueError(f"on_error is {on_error!r}, expected 'raise' or 'skip'")
     log = log if isinstance(log, Log) else Log("", tuple(slam.robots), list(log), format="")
-    refuse_other_columns(slam, log)
-    refuse_other_times(log)
-    slam.prepare_for(log.events)
-    recorder, observers = _Recorder(slam, log, pictures, config), tuple(observers)
+    recorder = Recorder(slam, log, pictures, config)
     begin = time.perf_counter()
-    with numba_event.install_listener("numba:compiler_lock", recorder.compiler), recorder.expectations:
-        for event in track(log.events, log.name or "log", len(log.events), show=progress, note=recorder.rate):
-            try:
-                report = recorder.process(event)
-                for observe in observers:
-                    observe(event, report)
-            except EventError as error:
-                if on_error == "raise" and not isinstance(error, ImageError):
-                    raise
-                recorder.skipped.append(str(error))
-            except DivergedError as error:
-                recorder.stopped = str(error)
-                break
+    events = track(log.events, log.name or "log", len(log.events), show=progress, note=recorder.rate)
+    recorder.take(events, on_error, tuple(observers))
     return recorder.run(time.perf_counter() - begin)
 
 
@@ -153,10 +139,16 @@ def _steps(kinds: set[type]) -> tuple[str, Any]:
     return "control", Control
 
 
-class _Recorder:
-    """Gathers one run; `process` is the hot path, everything is put in order afterwards by `run`."""
+class Recorder:
+    """Gathers one run; `process` is the hot path, everything is put in order by `run`, at the end or on the way.
+
+    It is for the events of a log, in their order.  Raises LogError as `record` does.
+    """
 
     def __init__(self, slam: Slam, log: Log, pictures: bool, config: Mapping[str, Any] | None) -> None:
+        refuse_other_columns(slam, log)
+        refuse_other_times(log)
+        slam.prepare_for(log.events)
         self.slam, self.log, self.pictures = slam, log, pictures
         self.config = configuration(slam, log) if config is None else dict(config)
         self.notes = [*not_described(slam, log)] if config is None else []
@@ -200,6 +192,24 @@ class _Recorder:
         """Return the rate of the latest images as a text; of a log with images."""
         latest = [ns for ns in self.step_ns[-LATEST:] if not math.isnan(ns)]
         return f"{1e9 * len(latest) / sum(latest):.0f} images/s" if self.has_images and latest else ""
+
+    def take(
+        self, events: Iterable[Event], on_error: str, observers: Sequence[Callable[[Event, Report], object]] = ()
+    ) -> None:
+        """Feed events, as `record` does, until the filter gives up: `stopped` is then the reason."""
+        with numba_event.install_listener("numba:compiler_lock", self.compiler), self.expectations:
+            for event in events:
+                try:
+                    report = self.process(event)
+                    for observe in observers:
+                        observe(event, report)
+                except EventError as error:
+                    if on_error == "raise" and not isinstance(error, ImageError):
+                        raise
+                    self.skipped.append(str(error))
+                except DivergedError as error:
+                    self.stopped = str(error)
+                    break
 
     def process(self, event: Event) -> Report:
         """Feed one event, return its report, and keep the step that ends with it: with a scan, if the log has any.
