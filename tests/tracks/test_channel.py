@@ -13,6 +13,7 @@ from scipy.stats import chi2
 import kalmark as km
 from kalmark.filter.map import StochasticMap
 from kalmark.geometry import POINT2, SE2
+from kalmark.geometry.spaces import mount_space
 from kalmark.tracks.channel import Channel, default_landmark, huber_length, landmarks_in_frame
 from kalmark.tracks.clones import Clones
 from kalmark.tracks.scan import ScanContext, Start
@@ -134,6 +135,49 @@ def test_a_landmark_starts_where_its_measurement_points_with_the_noise_of_that(m
     np.testing.assert_allclose(L_h, derivative(lambda x: started(x, y[0]), observer, plus), atol=1e-6)
     L_y = derivative(lambda y: started(observer, y), y[0])
     np.testing.assert_allclose(Q, L_y @ R @ L_y.T, rtol=1e-6, atol=1e-10)
+
+
+def test_a_landmark_starts_where_the_mount_was_the_lag_ago_with_the_jacobian_in_the_lag() -> None:
+    m, channel, y = StochasticMap(), channel_of(mount=1), np.array([[4.0, 0.4]])
+    channel = Channel(channel.sensor, MOUNT, 1, POINT, lambda dof: 9.0, [POINT], lags=True)
+    lag_s, v, w, before = 0.2, 0.8, 0.5, np.array([-0.16, 0.01, -0.1])  # before: the robot `lag_s` ago, from now
+    channel.past[:] = [lag_s, v, 0.0, w, *before]
+    m.add(SE2, ROBOT, P_ROBOT)
+    m.add(mount_space(3, 1), [*MOUNT, 0.25], 0.01 * np.eye(4))
+
+    def started(observer: np.ndarray) -> np.ndarray:
+        a = w * (lag_s - observer[6])
+        moved = np.array([v * math.sin(a) / w, v * (1.0 - math.cos(a)) / w, a])
+        place, heading = np.zeros(2), 0.0
+        for pose in (observer[:3], before, moved, observer[3:6]):
+            place, heading = place + km.geometry.rotation(heading) @ pose[:2], heading + pose[2]
+        return place + y[0, 0] * np.array([math.cos(heading + y[0, 1]), math.sin(heading + y[0, 1])])
+
+    def plus(x: np.ndarray, h: np.ndarray) -> np.ndarray:
+        return np.concatenate([SE2.plus(x[:3], h[:3]), SE2.plus(x[3:6], h[3:6]), x[6:] + h[6:]])
+
+    l, L_h, _ = channel.landmark_of(m, 0, y, R, False)
+    observer = channel.observer(m, 0)
+    np.testing.assert_allclose(l, started(observer), atol=1e-12)
+    np.testing.assert_allclose(L_h, derivative(started, observer, plus), atol=1e-6)
+
+
+def test_a_ray_whose_inverse_distance_is_given_starts_there() -> None:
+    m, channel, y = map_of(), channel_of(km.sensors.Bearing(0.02), landmark=RAY), np.array([[0.4]])
+    channel.rho["a"] = 0.25
+    starts = {id_: channel.landmark_of(m, 0, y, R[1:, 1:], False, 0, id_)[0] for id_ in ("a", "b", None)}
+    assert [float(starts[id_][3]) for id_ in starts] == [0.25, RAY.prior_rho_per_m, RAY.prior_rho_per_m]
+
+
+def test_a_sensor_of_depths_observes_rays_by_their_points_and_no_others_do() -> None:
+    for sensor, landmark, others, right in (
+        (km.sensors.RangeBearing(), POINT, [RAY], (True, True)),
+        (km.sensors.RangeBearing(), POINT, [], (False, False)),
+        (km.sensors.RangeBearingSignature(), km.landmarks.PointSignature2D(), [RAY], (False, False)),
+        (km.sensors.Wall(), km.landmarks.Wall2D(), [RAY], (False, False)),
+    ):
+        channel = Channel(sensor, MOUNT, -1, landmark, lambda dof: 9.0, [landmark, *others])
+        assert (RAY.kind in channel.kinds, channel.depths) == right, sensor
 
 
 def test_noise_that_grows_with_the_range_is_that_of_where_the_landmark_is() -> None:

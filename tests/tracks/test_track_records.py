@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
+from kalmark.errors import MapError
 from kalmark.tracks.channel import ROBOT, Channel
 from kalmark.tracks.track import RECENT, Pending, Status, Track, Tracks
 
@@ -178,3 +179,11 @@ def test_what_follows_from_the_records_of_a_file_is_computed_anew() -> None:
     again.confirmed, again.slots, again.changes = right.confirmed, dict(right.slots), 7
     again.number()
     assert (again.names, again.sorts, again.slots, again.changes) == (right.names, right.sorts, right.slots, 7)
+
+
+def test_a_record_of_a_file_is_refused_for_its_counts_and_its_extent_alone() -> None:
+    for track in (Track("a", POINT, 1), Track("w", WALL, 1, extent=np.zeros(2))):
+        track.restored()
+    for broken in (Track("a", POINT, 1, observations=-1), Track("w", WALL, 1, extent=np.zeros(3))):
+        with pytest.raises(MapError, match="has the counts"):
+            broken.restored()

@@ -109,10 +109,12 @@ class SpaceMountConfig(SpacePose):
 
 def _with_state(base: type[Section], world: str, sigma: Any, each: str) -> Any:
     """Return a section with the keys of what a state has behind its pose; `sigma` and `each` are of their sigmas."""
+    keys, sigmas = dict[str, Any](), dict[str, Any]()
+    for name, text in STATES[world].items():
+        keys[name] = Number, Field(0.0, description=text)
+        sigmas[sigma_of(name)[0]] = sigma, Field(0.0, description=each)
     text = "Components of the state after its pose, of a motion of your own with other names than these."
-    keys: dict[str, Any] = {name: (Number, Field(0.0, description=text)) for name, text in STATES[world].items()}
-    keys |= {sigma_of(name)[0]: (sigma, Field(0.0, description=each)) for name in STATES[world]}
-    return create_model("Start", __base__=base, **keys, state=(Numbers | None, Field(None, description=text)))
+    return create_model("Start", __base__=base, **keys, **sigmas, state=(Numbers | None, Field(None, description=text)))
 
 
 OF_PLANE: Any = _with_state(PlanePose, "plane", NotNegative, "Standard deviation of each such component.")
@@ -197,7 +199,8 @@ SpaceSensor = Annotated[Any, Choice("sensor", "space")]
 
 def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None:
     """Refuse values of a start for a state that its motion does not have.  Raises ValueError."""
-    has = state_names(state_columns(model_of(motion)), world_of(vars(start)))
+    world = world_of(vars(start))
+    states, has = STATES[world], state_names(state_columns(model_of(motion)), world)
     allowed = {*has, *(sigma_of(name)[0] for name in has)}
     if isinstance(start, SpaceStartConfig) and start.at_rest:
         if "bias_ax_mps2" not in has:
@@ -205,9 +208,8 @@ def refuse_odd_start(motion: Any, start: StartConfig | SpaceStartConfig) -> None
         if not np.all(start.sigma_bias_a_mps2):
             what = "a positive number: at rest a bias is taken for a tilt"
             raise unexpected_value(what, "start", "sigma_bias_a_mps2")
-    states = *STATES["plane"], *STATES["space"]
     for key in dict.fromkeys((*states, *(sigma_of(name)[0] for name in states))):
-        if key in type(start).model_fields and key not in allowed and np.any(getattr(start, key)):
+        if key not in allowed and np.any(getattr(start, key)):
             what = next((word for word in ("slip", "bias", "gravity") if word in key), "velocity like this")
             raise unexpected_value(f"0: {motion.type} has no {what} in its state", "start", key)
 
