@@ -168,9 +168,9 @@ class _Ranges(NamedTuple):
     def solve(self, l: Array, some: Index) -> Array:
         """Return the pose from which some of the landmarks l (K, 3) are so far.
 
-        With p from the middle m of the landmarks, 2 (l - m)'p = |l - m|^2 - r^2 + |p|^2: their differences determine p,
-        but across landmarks in a plane.  The search begins on both sides of it.  Where neither is likelier by `SURE`, it
-        is that of T: few robots are carried through a ceiling, or out of the water.
+        With p from the middle m of the landmarks, 2 (l - m)'p = |l - m|^2 - r^2 + |p|^2: the differences give p,
+        but across landmarks in a plane.  The search begins on both sides of it.  Where neither is likelier by `SURE`,
+        it is that of T: few robots are carried through a ceiling, or out of the water.
         """
         l, r = l[some], self.r[some]
         m = l.mean(axis=0)
