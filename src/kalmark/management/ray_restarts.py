@@ -24,6 +24,7 @@ from kalmark.tracks import linearity
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 
+TINY = 1e-300
 SHARE = 0.05  # of the way from its anchor that a mount may leave open
 
 
@@ -35,17 +36,21 @@ def bent_rays(scan: ScanContext, model: ObservationModel, slots: Index, rows: li
     """
     if not isinstance(model.landmark, Reparametrizable):
         return np.zeros(len(rows), dtype=np.bool_)
-    map_, d, R = scan.map, scan.dimensions, scan.noise(model, slots, rows)
+    map_, d = scan.map, scan.dimensions
     l = map_.means(slots, model.d)
     v, _, V_l = model.landmark.seen_from(scan.pose(), l)
     v, t = v[:, :d], V_l[:, :d, -1]
-    E_rho = linearize(model.model, scan.channel.head(map_, scan.robot), l, scan.y[rows])[3][:, :, -1]
-    slope = np.sqrt(np.sum(E_rho * np.linalg.solve(R, E_rho[..., None])[..., 0], axis=1))
-    by_noise = np.linalg.norm(t, axis=1) / np.linalg.norm(v, axis=1)
-    variance = np.array([map_.covariance([slot])[-1, -1] for slot in slots.tolist()])
-    left = variance / (1.0 + variance * np.maximum(slope - linearity.SIGMAS * by_noise, 0.0) ** 2)
-    change = linearity.SIGMAS * np.sqrt(left) * np.abs(np.sum(v * t, axis=1))
-    return np.asarray(change > linearity.SHARE * np.sum(v * v, axis=1))
+    least = linearity.SHARE * np.sum(v * v, axis=1) / (linearity.SIGMAS * np.abs(np.sum(v * t, axis=1)) + TINY)
+    dof = model.landmark.space.dof
+    variance = map_.covariance(slots.tolist()).diagonal()[dof - 1 :: dof]
+    found: Flags = variance > least**2
+    if found.any():
+        E_rho = linearize(model.model, scan.channel.head(map_, scan.robot), l, scan.y[rows])[3][:, :, -1]
+        R_E = np.linalg.solve(scan.noise(model, slots, rows), E_rho[..., None])[..., 0]
+        by_noise = linearity.SIGMAS * np.linalg.norm(t, axis=1) / np.linalg.norm(v, axis=1)
+        added = np.maximum(np.sqrt(np.sum(E_rho * R_E, axis=1)) - by_noise, 0.0) ** 2
+        found = variance > least**2 * (1.0 + variance * added)
+    return found
 
 
 def rays_without_baseline(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:
