@@ -24,7 +24,6 @@ from kalmark.tracks import linearity
 from kalmark.tracks.channel import ObservationModel
 from kalmark.tracks.scan import ScanContext
 
-TINY = 1e-300
 SHARE = 0.05  # of the way from its anchor that a mount may leave open
 
 
@@ -40,7 +39,8 @@ def bent_rays(scan: ScanContext, model: ObservationModel, slots: Index, rows: li
     l = map_.means(slots, model.d)
     v, _, V_l = model.landmark.seen_from(scan.pose(), l)
     v, t = v[:, :d], V_l[:, :d, -1]
-    least = linearity.SHARE * np.sum(v * v, axis=1) / (linearity.SIGMAS * np.abs(np.sum(v * t, axis=1)) + TINY)
+    along = np.maximum(np.abs(np.sum(v * t, axis=1)), 1e-300)
+    least = linearity.SHARE * np.sum(v * v, axis=1) / (linearity.SIGMAS * along)
     dof = model.landmark.space.dof
     variance = map_.covariance(slots.tolist()).diagonal()[dof - 1 :: dof]
     found: Flags = variance > least**2
