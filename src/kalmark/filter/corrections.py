@@ -375,13 +375,12 @@ def fuse_scan(
     """
     (x, P, n, _blocks, atoms, _axes, ways), (H, M, v) = map_, linear
     index, places, _table, _mean, _P_ss, sizes, turning = block
-    h, placed = sizes[3], (atoms, index, places, x.copy(), n)
-    prior = coordinates(model, ways, (turning, sizes), placed, P, iterates)
-    V, correction = gain(sparse_product(H, take_rows(P, index, n), h + sizes[4], count), M, v)
+    prior = coordinates(model, ways, (turning, sizes), (atoms, index, places, x.copy(), n), P, iterates)
+    V, correction = gain(sparse_product(H, take_rows(P, index, n), sizes[3] + sizes[4], count), M, v)
     a, s, S = retract_in(model, ways, prior, x, correction)
     downdate_and_transport(P, V, a, prior[2])
     if len(prior[6][0]):
-        parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, index[:h], prior[0][3], x, prior[6], s, S))
+        parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, index[: sizes[3]], prior[0][3], x, prior[6], s, S))
 
 
 @compiled
