@@ -14,7 +14,7 @@ here indexes its arrays: slices, products and fancy indices are what takes numba
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
@@ -77,9 +77,25 @@ Sizes = tuple[int, int, int, int, int, int]  # see `predicted`
 Scan = tuple[int, int, Index, int, Array, Array, float]  # robot, mount, slots, d, y, R, gate
 Block = tuple[Index, Index, Table, Array, Array, Sizes, Turning]  # rows in P, places of the head in x, atoms, mean, P
 Placed = tuple[Table, Index, Index, Array, int]  # atoms of a mean, rows of an observed block, places of its head, x, n
-Coordinates = tuple[
-    Placed, Array, Index, Array, Array, Array, parallax.Baselines, tuple[Turning, Sizes]
-]  # where a mean is placed, head, theta, L, R_r, generator, baselines, what turns: see `coordinates`
+
+
+class Coordinates(NamedTuple):
+    """Error coordinates of a mean, which is `placed`: all that does not change while it is corrected.
+
+    `head` (h,) is its part that observes, `theta` (k,) are the rows of the errors that turn others, L (n, m) is the
+    regression on those of a mount and of other units, R_r the robot's rotation, `generator` (n, axes) how all errors
+    move when the world turns.
+    """
+
+    placed: Placed
+    head: Array
+    theta: Index
+    L: Array
+    R_r: Array
+    generator: Array
+    baselines: parallax.Baselines
+    turns: tuple[Turning, Sizes]
+
 
 RETRACT = signature_of("none(i8[:, ::1], f8[::1], f8[::1], f8[::1])")
 GENERATOR = signature_of("f8[:, ::1](i8[:, ::1], f8[::1], i8, i8, f8[::1])")
@@ -181,7 +197,7 @@ def coordinates(
     if len(depths):
         s, S = sensor_at(model, head, ways[_SENSOR_AT])
         c2 = parallax.call_spread(ways[_SPREAD], (P, rows[:h], x, s, S, depths))
-    return placed, head, theta, L, R_r, generator, (depths, s, S, c2), turns
+    return Coordinates(placed, head, theta, L, R_r, generator, (depths, s, S, c2), turns)
 
 
 @compiled_by_model
@@ -231,7 +247,7 @@ def iterate(
     v, H, HP, Z = linear
     placed = table, np.arange(n), np.arange(head), mean, n
     prior = coordinates(model, ways, (turning, sizes), placed, P_ss, most > 1)
-    theta, baselines, correction, weights = prior[2], prior[6], np.zeros(n), np.zeros(n)
+    baselines, correction, weights = prior.baselines, np.zeros(n), np.zeros(n)
     best, best_weights = correction, weights
     first = least = cost = cost_of(v.reshape(k, p), R, correction, weights)
     for j in range(2 * most):
@@ -247,7 +263,7 @@ def iterate(
             H, v = stack_jacobians(E_r, E_l, n), ravel(z)
             if len(baselines[0]):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s, S))
-            transport_rows(H, v, a, theta, correction)
+            transport_rows(H, v, a, prior.theta, correction)
             HP, Z = joint_innovation(H, P_ss, R, behind)
         M, positive = cholesky_inverse(Z)
         if not positive:
@@ -378,9 +394,11 @@ def fuse_scan(
     prior = coordinates(model, ways, (turning, sizes), (atoms, index, places, x.copy(), n), P, iterates)
     V, correction = gain(sparse_product(H, take_rows(P, index, n), sizes[3] + sizes[4], count), M, v)
     a, s, S = retract_in(model, ways, prior, x, correction)
-    downdate_and_transport(P, V, a, prior[2])
-    if len(prior[6][0]):
-        parallax.call_transport(ways[_TRANSPORT_PARALLAX], (P, n, index[: sizes[3]], prior[0][3], x, prior[6], s, S))
+    downdate_and_transport(P, V, a, prior.theta)
+    if len(prior.baselines[0]):
+        parallax.call_transport(
+            ways[_TRANSPORT_PARALLAX], (P, n, index[: sizes[3]], prior.placed[3], x, prior.baselines, s, S)
+        )
 
 
 @compiled
@@ -491,7 +509,7 @@ def correct_by_average(
     a = retract_in(model, ways, prior, x, correction)[0]
     downdate(P, V)
     add_square(P, spread)
-    transport(P, a, prior[2])
+    transport(P, a, prior.theta)
     return d2, True
 
 
