@@ -397,6 +397,7 @@ def test_sensors_of_functions_in_a_file_are_the_same_from_the_folder_of_a_run(
     assert run.config["robots"]["r"]["sensors"]["s"]["type"] == "my_functions.py:sonar"
     run.save(tmp_path / "run")
     again, log = run_again(tmp_path / "run")
+    assert all(hasattr(model, "columns") for model in built_in("sensor"))  # it is none of kalmark's own
     assert {name: mount.sensor for name, mount in again.robots["r"].sensors.items()} == {
         "s": mine.sonar, "tape": mine.tape
     }  # fmt: skip
