@@ -539,7 +539,8 @@ def class_of_file(name: str) -> type | None:
     place, _, attribute = name.rpartition(":")
     for file, module in _PLUGINS.items():
         if place in (file.stem, file.name, str(file)) and (model := vars(module).get(attribute)) is not None:
-            return model if isinstance(model, type) else type(attribute, (), {"__new__": lambda cls: model})
+            made = {"__module__": module.__name__, "__new__": lambda cls: model}
+            return model if isinstance(model, type) else type(attribute, (), made)
     return None
 
 
