@@ -157,7 +157,7 @@ def predicted(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array, Block, L
 
     The rows of other units that turn are behind those of the head.  The sizes of a block are the numbers of the pose
     and of the head, the axes of the gauge, the rows of the head and of other units, and whether the robot is an
-    inertial unit whose gravity is known, whose errors of tilt turn.
+    inertial unit whose gravity is known, whose errors of tilt turn.  [S] (26), (27).
     """
     x, P, _n, blocks, atoms, axes, _ways = map_
     robot, mount, slots, d, y, R, _gate = scan
@@ -213,7 +213,7 @@ def retract_in(
     axes, h, level = sizes[2], sizes[3], sizes[5]
     own = take_entries(correction, rows)
     turn = gauge(head, own, turning, axes)
-    step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, rows[0] + 3))
+    step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, rows[0] + 3))  # the row of the rotation
     E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_entries(step, rows), turning, axes))
     call_retract(ways[_RETRACT], (table, x, step, turn))
     call_carry(ways[_CARRY], (table, x, L, W, d))
