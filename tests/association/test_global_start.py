@@ -98,6 +98,18 @@ def test_poses_are_one_within_half_a_metre_and_a_tenth_of_a_radian() -> None:
     assert [pose.pairs for pose in distinct(poses)] == [2, 0]
 
 
+def test_supporters_are_counted_as_one_by_one_of_the_poses_that_may_be_the_best() -> None:
+    rng = np.random.default_rng(3)
+    places, v, reach = rng.uniform(-20, 20, (60, 2)), rng.uniform(-15, 15, (12, 2)), rng.uniform(1.0, 4.0, 12)
+    poses = np.column_stack([rng.uniform(-5, 5, (400, 2)), rng.uniform(-3, 3, 400)])
+    gaps = np.linalg.norm(global_start.points_at_poses(poses, v)[:, :, None] - places, axis=3).min(axis=2)
+    each = (gaps <= reach).sum(axis=1)
+    counts = global_start.count_supporters(poses, v, reach, places[np.argsort(places[:, 0])], 5)
+    assert set(counts[each < 5]) == {0} and each.max() > 6
+    assert (counts[each > each.max() - 2] == each[each > each.max() - 2]).all()
+    assert np.isin(counts, [0, *each]).all() and (counts <= each).all()
+
+
 def test_matchings_by_chance_are_the_tail_of_a_binomial() -> None:
     of, v = known(PLACES), np.zeros((7, 2))
     p = of.density() * np.pi * chi2.ppf(REACH, 2) * 2 * 0.3**2
@@ -120,9 +132,9 @@ def test_a_scan_that_does_not_determine_a_pose_is_refused_with_the_reason() -> N
     alike = "its scan fits 4 landmarks from another pose, and 4 from this one"
     assert search(known(square), corners, SIGMA[:4]) == alike
     elsewhere = np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 70.0]])
-    assert search(known(PLACES), elsewhere, SIGMA[:3]) == "no pose in the known map explains its scan"
+    assert search(known(PLACES), elsewhere, SIGMA[:3]) == "no pose in the known map explains most of its 3 observations"
     strange = np.vstack([to_frame(T, PLACES[:3])[0], [[50.0, 50.0], [70.0, -40.0], [-60.0, 33.0]]])
-    assert search(known(PLACES), strange, SIGMA) == "at most 3 of its 6 observations agree with a pose in the known map"
+    assert search(known(PLACES), strange, SIGMA) == "3 observations agree, 0.003 poses as good are expected by chance"
     few = "its scan has 0 landmarks with ids, a pose by these needs 3"
     assert (
         locate_rays(Known(km.landmarks.Point2D()), ["a", "b"], corners[:2], SIGMA[:2]) == few

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.association.relocalization import align_points, is_same_pose, resect
+from kalmark.association.relocalization import SAME_M, SAME_RAD, align_points, resect
+from kalmark.compiled import compiled
 from kalmark.events import Id
 from kalmark.geometry import frames3d
+from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import SE2, SE3
@@ -39,7 +40,6 @@ REACH = 0.999  # of right pairs pass the gate
 AS_GOOD = 2  # a pose with so many pairs less may be the right one
 BY_CHANCE = 1e-3  # matchings as good that may be expected by chance
 MOST_PAIRS = 2_000_000  # of landmarks
-AT_ONCE = 20_000  # poses tested at once
 
 
 class GlobalPose(NamedTuple):
@@ -260,29 +260,30 @@ def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:
         T = hypotheses(of, v, sigma, i, j)
         tried += len(T)
         poses += supported_poses(of, v, sigma, T, (i, j))
-    poses = distinct([refine_pose(of, v, sigma, pose) for pose in poses])
+    poses = distinct(poses)
     if not poses:
-        return "no pose in the known map explains its scan"
+        return f"no pose in the known map explains most of its {len(v)} observations"
+    chance = by_chance(of, v, sigma, poses[0].pairs, tried)
+    if chance > BY_CHANCE:
+        return f"{poses[0].pairs} observations agree, {chance:.1g} poses as good are expected by chance"
+    poses = distinct([refine_pose(of, v, sigma, pose) for pose in poses])
     best = poses[0]
     if best.pairs < FEWEST or 2 * best.pairs <= len(v):
         return f"at most {best.pairs} of its {len(v)} observations agree with a pose in the known map"
     if len(poses) > 1 and poses[1].pairs > best.pairs - AS_GOOD:
         return f"its scan fits {poses[1].pairs} landmarks from another pose, and {best.pairs} from this one"
-    chance = by_chance(of, v, sigma, best.pairs, tried)
-    if chance > BY_CHANCE:
-        return f"{best.pairs} observations agree, {chance:.1g} poses as good are expected by chance"
     return best
 
 
 def bases(v: Array, sigma: Array) -> list[tuple[int, int]]:
     """Return pairs of observations, those that determine a heading best first; no observation is in most of them."""
-    pairs = [(float(np.linalg.norm(v[i] - v[j]) / np.hypot(sigma[i], sigma[j])), i, j)
-             for i, j in combinations(range(len(v)), 2)]  # fmt: skip
+    i, j = np.triu_indices(len(v), 1)
+    best = np.lexsort((j, i, np.linalg.norm(v[i] - v[j], axis=1) / np.hypot(sigma[i], sigma[j])))[::-1]
     used, found = np.zeros(len(v), dtype=np.int64), list[tuple[int, int]]()
-    for _, i, j in sorted(pairs, reverse=True):
-        if max(used[i], used[j]) < 2:
-            found.append((i, j))
-            used[[i, j]] += 1
+    for one, other in zip(i[best].tolist(), j[best].tolist(), strict=True):
+        if max(used[one], used[other]) < 2:
+            found.append((one, other))
+            used[[one, other]] += 1
         if len(found) == BASES:
             break
     return found
@@ -302,21 +303,43 @@ def hypotheses(of: Known, v: Array, sigma: Array, i: int, j: int) -> Array:
 
 
 def supported_poses(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -> list[GlobalPose]:
-    """Return of poses (H, 3) from a base those that most of the scan agrees with."""
+    """Return of poses (H, 3) from a base those with which most of the scan agrees, or with `AS_GOOD` more would."""
     i, j = base
     turn = np.hypot(sigma[i], sigma[j]) / np.linalg.norm(v[j] - v[i])
     lever = np.linalg.norm(v - (v[i] + v[j]) / 2, axis=1)
     spread = np.sqrt(sigma**2 + (sigma[i] ** 2 + sigma[j] ** 2) / 4 + (turn * lever) ** 2)
-    found: list[GlobalPose] = []
-    for at in range(0, len(T), AT_ONCE):
-        some = T[at : at + AT_ONCE]
-        gaps, rows = of.tree().query(points_at_poses(some, v))
-        near: Flags = gaps**2 <= chi2_gate(REACH, 2) * spread**2
-        counts = near.sum(axis=1)
-        for h in np.flatnonzero((counts >= FEWEST) & (counts >= counts.max() - AS_GOOD)).tolist():
-            found.append(GlobalPose(some[h], np.where(near[h], rows[h], -1)))
-    most = max((pose.pairs for pose in found), default=0)
-    return [pose for pose in found if pose.pairs > most - AS_GOOD]
+    reach, places = math.sqrt(chi2_gate(REACH, 2)) * spread, of.places()
+    least = max(FEWEST, len(v) // 2 + 1 - AS_GOOD)
+    counts = count_supporters(T, v, reach, places[np.argsort(places[:, 0], kind="stable")], least)
+    best = T[(counts > 0) & (counts > counts.max(initial=0) - AS_GOOD)]
+    gaps, rows = of.tree().query(points_at_poses(best, v))
+    return [GlobalPose(*one) for one in zip(best, np.where(gaps <= reach, rows, -1), strict=True)]
+
+
+@compiled
+def count_supporters(T: Array, v: Array, reach: Array, places: Array, least: int) -> Index:
+    """Return how many of v (K, 2) each pose T (H, 3) moves within their `reach` (K,) of one of the places (N, 2).
+
+    These are in the order of x.  It is 0 of a pose with less than `least`, or with `AS_GOOD` less than one before it.
+    """
+    counts, most, k = np.zeros(len(T), np.int64), least + AS_GOOD - 1, len(v)
+    for h in range(len(T)):
+        c, s, count, left = math.cos(T[h, 2]), math.sin(T[h, 2]), 0, k
+        while left > 0 and count + left > most - AS_GOOD:
+            left -= 1
+            x, y = c * v[left, 0] - s * v[left, 1] + T[h, 0], s * v[left, 0] + c * v[left, 1] + T[h, 1]
+            low, high = 0, len(places)
+            while low < high:
+                middle = (low + high) // 2
+                low, high = (middle + 1, high) if places[middle, 0] < x - reach[left] else (low, middle)
+            while low < len(places) and places[low, 0] <= x + reach[left]:
+                if (places[low, 0] - x) ** 2 + (places[low, 1] - y) ** 2 <= reach[left] ** 2:
+                    count += 1
+                    break
+                low += 1
+        if count > most - AS_GOOD:
+            counts[h], most = count, max(most, count)
+    return counts
 
 
 def points_at_poses(T: Array, v: Array) -> Array:
@@ -346,10 +369,12 @@ def refine_pose(of: Known, v: Array, sigma: Array, pose: GlobalPose) -> GlobalPo
 
 def distinct(poses: list[GlobalPose]) -> list[GlobalPose]:
     """Return poses that are different ones, those with most pairs first."""
-    out: list[GlobalPose] = []
-    for pose in sorted(poses, key=lambda pose: -pose.pairs):
-        if not any(is_same_pose(pose.T, other.T) for other in out):
-            out.append(pose)
+    out, left = list[GlobalPose](), sorted(poses, key=lambda pose: -pose.pairs)
+    while left:
+        out.append(left[0])
+        off = np.array([pose.T for pose in left]) - left[0].T
+        same = (np.hypot(off[:, 0], off[:, 1]) <= SAME_M) & (np.abs(wrap(off[:, 2])) <= SAME_RAD)
+        left = [pose for pose, is_one in zip(left, same.tolist(), strict=True) if not is_one]
     return out
 
 
