@@ -173,3 +173,18 @@ def test_a_robot_that_is_placed_keeps_its_velocity_in_its_own_frame(motion: Any)
 
     spread = np.cov([drawn(error) for error in errors], rowvar=False)
     np.testing.assert_allclose(map_.covariance([moving.slot])[6:9, 6:9], spread, atol=0.008)
+
+
+def test_a_robot_that_is_placed_has_its_constants_again_as_they_were_stated() -> None:
+    gauge = km.Mount(km.sensors.Height(0.05, bias_m=0.3, sigma_bias_m=0.2))
+    slam = km.Slam(km.Robot("r", km.motion.Odometry3D(0.02, 0.02, 0.02, 0.01), sensors={"gauge": gauge}, cov=np.eye(6)))
+    stated, moving = slam.mean("r.gauge"), slam.state.moving["r"]
+    slam.process(km.Scan(0.1, "r", "gauge", [[2.0]]))
+    assert abs(slam.mean("r.gauge") - stated).max() > 0.05
+    pose = np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
+    write_robot(slam.state.map, moving, pose, 0.01 * np.eye(6))
+    np.testing.assert_array_equal(slam.mean("r"), pose)
+    np.testing.assert_array_equal(slam.mean("r.gauge"), stated)
+    P = slam.covariance("r", "r.gauge")
+    np.testing.assert_allclose(P, np.diag(P.diagonal()), atol=1e-15)
+    np.testing.assert_allclose(P.diagonal()[[*range(6), -1]], [*[0.01] * 6, 0.2**2])

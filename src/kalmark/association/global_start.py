@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
-from kalmark.association.relocalization import SAME_M, SAME_RAD, align_points, resect
+from kalmark.association.relocalization import SAME_M, SAME_RAD, align_points, is_same_pose, resect
 from kalmark.compiled import compiled
 from kalmark.events import Id
 from kalmark.geometry import frames3d
@@ -29,7 +29,7 @@ from kalmark.tracks.scan import FEWEST_RANGES
 
 FEWEST = 3  # pairs without ids
 FEWEST_NAMED = {2: 2, 3: 3}  # with ids, by the dimensions of the world
-FEWEST_RAYS = {2: 3, 3: 6}  # directions with ids
+FEWEST_RAYS = {2: 3, 3: 4}  # directions with ids
 ANY_RAD = math.pi / math.sqrt(3.0)  # sigma of an attitude that may be any, on each axis
 STEPS = 5  # of least squares
 LOOSE = 2.0  # sigmas of an observation, for what is uncertain between landmarks of the map
@@ -128,8 +128,16 @@ class _Rays(NamedTuple):
     sigma: Array
 
     def solve(self, l: Array, some: Index) -> Array:
-        """Return the pose by some of the landmarks l (K, d): the linear solution, then least squares of the angles."""
-        T = resect(self.v[some], l[some])
+        """Return the pose by some of the landmarks l (K, d), that from which most fit, if there is one."""
+        found = [self._refined(T, l, some) for T in resect(self.v[some], l[some])]
+        found.sort(key=lambda T: float(np.sum(self.misfits(T, l, some))))
+        fits = [T for T in found if (self.misfits(T, l, some) <= 1.0).all()]
+        if not found or any(not is_same_pose(T, fits[0]) for T in fits):
+            raise np.linalg.LinAlgError("no pose, or several")
+        return found[0]
+
+    def _refined(self, T: Array, l: Array, some: Index) -> Array:
+        """Return the pose of the least squares of the angles, from T on."""
         space = SE2 if len(T) == 3 else SE3
         for _ in range(STEPS):
             off, J, _ = self._angles(T, l, some)

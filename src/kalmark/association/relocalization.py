@@ -1,6 +1,6 @@
 """The pose that observed points or directions and landmarks in pairs determine in closed form.
 
-Points, l = T v: Umeyama 1991.  Directions: Hartley and Zisserman, Multiple View Geometry 7.
+Points, l = T v: Umeyama 1991.  Directions: Hartley and Zisserman, Multiple View Geometry 7; Grunert 1841.
 """
 
 from __future__ import annotations
@@ -28,30 +28,57 @@ def align_points(v: Array, l: Array, weights: Array) -> Array:
     return np.concatenate([b - Q @ a, turn])
 
 
-def resect(v: Array, l: Array) -> Array:
-    """Return the pose T, (3,) or (7,), from which landmarks l (K, d) are in the directions v (K, d), in least squares.
+def resect(v: Array, l: Array) -> list[Array]:
+    """Return the poses T, (3,) or (7,), from which landmarks l (K, d) are in the directions v (K, d); K is at least 3.
 
-    It is the direct linear transformation: v x (Q l + t) = 0 is linear in Q and t, of which the scale is free.  K is at
-    least 3 in the plane, 6 in space.
+    In the plane it is one, by the direct linear transformation: v x (Q l + t) = 0 is linear in Q and t, of which the
+    scale is free.  In space there are up to four, by three directions that are far apart.
     """
-    d, middle = v.shape[1], l.mean(axis=0)
-    p = (l - middle) / max(float(np.abs(l - middle).max()), 1e-300)
-    if d == 2:  # Q = [[c, s], [-s, c]]
-        across = np.stack([v[:, 1], -v[:, 0]], axis=1)
-        A = np.column_stack([np.sum(across * p, axis=1), across[:, 0] * p[:, 1] - across[:, 1] * p[:, 0], across])
-        c, s, *t = np.linalg.svd(A)[2][-1]
-        M = np.array([[c, s], [-s, c]])
-    else:
-        across = np.linalg.svd(v[:, None, :])[2][:, 1:]
-        A = np.concatenate([np.einsum("kad,ke->kade", across, p).reshape(len(v), 2, 9), across], axis=2)
-        x = np.linalg.svd(A.reshape(-1, 12))[2][-1]
-        M, t = x[:9].reshape(3, 3), x[9:]
-    M, t = (a * np.sign(np.sum((p @ M.T + t) * v)) for a in (M, np.array(t)))  # in front of the sensor
-    U, size, Vt = np.linalg.svd(M)
-    Q = U @ np.diag(np.append(np.ones(d - 1), np.linalg.det(U @ Vt))) @ Vt
-    t = t / max(float(size.mean()), 1e-300) * np.abs(l - middle).max()
-    place = middle - Q.T @ t
-    return np.append(place, math.atan2(Q.T[1, 0], Q.T[0, 0])) if d == 2 else np.concatenate([place, from_matrix(Q.T)])
+    return [_resect_in_plane(v, l)] if v.shape[1] == 2 else _resect_by_three(v, l)
+
+
+def _resect_in_plane(v: Array, l: Array) -> Array:
+    middle = l.mean(axis=0)
+    size = max(float(np.abs(l - middle).max()), 1e-300)
+    p, across = (l - middle) / size, np.stack([v[:, 1], -v[:, 0]], axis=1)  # Q = [[c, s], [-s, c]]
+    A = np.column_stack([np.sum(across * p, axis=1), across[:, 0] * p[:, 1] - across[:, 1] * p[:, 0], across])
+    c, s, *t = np.linalg.svd(A)[2][-1]
+    Q, t = np.array([[c, s], [-s, c]]), np.array(t)
+    ahead = np.sign(np.sum((p @ Q.T + t) * v))  # in front of the sensor
+    Q, t = ahead * Q / math.hypot(c, s), ahead * t / math.hypot(c, s)
+    return np.append(middle - Q.T @ t * size, math.atan2(Q[0, 1], Q[0, 0]))
+
+
+def _resect_by_three(v: Array, l: Array) -> list[Array]:
+    """Return the poses (7,) by three directions: a quartic.  Haralick, Lee, Ottenberg and Noelle 1994, (9) and (10).
+
+    The distances of the three are s (1, u, w), a, b and c those between them, opposite to each.  Of complex roots,
+    which noise makes of a double one, it is the real part.
+    """
+    v = v / np.linalg.norm(v, axis=1, keepdims=True)
+    first = int(np.argmin(v @ v.mean(axis=0)))
+    second = int(np.argmin(v @ v[first]))
+    three = [first, second, int(np.argmax(np.abs(v @ np.cross(v[first], v[second]))))]
+    j, p, poses = v[three], l[three], list[Array]()
+    cos_a, cos_b, cos_c = j[1] @ j[2], j[0] @ j[2], j[0] @ j[1]
+    b2 = max(float(np.sum((p[0] - p[2]) ** 2)), 1e-300)
+    a2, c2 = np.sum((p[1] - p[2]) ** 2) / b2, np.sum((p[0] - p[1]) ** 2) / b2
+    d = a2 - c2
+    quartic = (
+        (d - 1) ** 2 - 4 * c2 * cos_a**2,
+        4 * (d * (1 - d) * cos_b - (1 - a2 - c2) * cos_a * cos_c + 2 * c2 * cos_a**2 * cos_b),
+        2 * (d**2 - 1 + 2 * d**2 * cos_b**2 + 2 * (1 - c2) * cos_a**2)
+        - 8 * (a2 + c2) * cos_a * cos_b * cos_c + 4 * (1 - a2) * cos_c**2,
+        4 * (2 * a2 * cos_c**2 * cos_b - d * (1 + d) * cos_b - (1 - a2 - c2) * cos_a * cos_c),
+        (1 + d) ** 2 - 4 * a2 * cos_c**2,
+    )  # fmt: skip
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for w in np.roots(quartic).real:
+            u = ((d - 1) * w**2 - 2 * d * cos_b * w + 1 + d) / (2 * (cos_c - w * cos_a))
+            s = np.sqrt(b2 / (1 + w**2 - 2 * w * cos_b)) * np.array([1.0, u, w])
+            if np.isfinite(s).all() and (s > 0.0).all():
+                poses.append(align_points(s[:, None] * j, p, np.ones(3)))
+    return poses
 
 
 def is_same_pose(one: Array, other: Array) -> bool:

@@ -282,7 +282,8 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
     the pose of which the landmarks l that it sees are least squares, d r = (sum A'A)^-1 sum A' d l, A = d l / d r.
     """
     robot, slot, tracks = scan.event.robot, scan.robot, state.tracks
-    before, after, cov = state.map.mean(slot), other.map.mean(slot), other.map.covariance([slot])
+    own = [slot, *(constant for constant, _, _ in other.moving.constants)]
+    before, after, cov = state.map.mean(slot), other.map.mean(slot), other.map.covariance(own)
     d, dof = scan.dimensions, scan.channel.pose_dof
     A, mapped = list[Array](), [name for name in fits if name not in tracks.known]
     for name in fits:
@@ -291,14 +292,15 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
         A.append(np.hstack([np.eye(space.dof, d), space.generator(l)]))
     ends = np.cumsum([0, *(len(part) for part in A)])
     G = np.split(np.linalg.pinv(np.concatenate(A)), ends[1:-1], axis=1)
-    parts = ((slot, len(cov)), *((tracks.slots[name], len(A[fits.index(name)])) for name in mapped))
-    rows, own = state.rows(parts), slice(0, len(cov))
+    sizes = (*(len(state.map.rows(one)) for one in own), *(len(A[fits.index(name)]) for name in mapped))
+    rows = state.rows((*zip((*own, *(tracks.slots[name] for name in mapped)), sizes, strict=True),))
     F, Q = np.eye(len(rows)), np.zeros((len(rows), len(rows)))
-    F[own], Q[own, own] = 0.0, cov
+    F[: len(cov)], Q[: len(cov), : len(cov)] = 0.0, cov
     F[:dof, len(cov) :] = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] for name in mapped)])
     of.weigh(_mapped_again(state, scan, of, before, after, cov))
     state.map.predict(rows, F, Q)
-    state.map.set_predicted(slot, after)
+    for one in own:
+        state.map.set_predicted(one, other.map.mean(one))
     for name in [name for name in of.young if name in tracks.confirmed]:
         state.remove(name)
         scan.report.removed += ((name, MEANWHILE),)

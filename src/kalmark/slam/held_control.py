@@ -257,6 +257,7 @@ class Moving:
     None where there is none.
     `left_out` are the last fixes, if they were outside the gate.  `past` are its last motions, where a sensor lags.
     `fastest` are the greatest speed and turn rate, m/s and rad/s, that a state with a velocity has had.
+    `constants` are the slots of the bias and of its mounts, each with the mean and the covariance that were stated.
     """
 
     motion: Motion
@@ -267,6 +268,7 @@ class Moving:
     left_out: list[RejectedFix] = field(default_factory=list)
     past: PastMotion | None = None
     fastest: tuple[float, float] = 0.0, 0.0
+    constants: list[tuple[int, Array, Array]] = field(default_factory=list)
     SAVED: ClassVar = ("slot", "bias", "held", "error", "left_out", "past", "fastest")
 
     @cached_property

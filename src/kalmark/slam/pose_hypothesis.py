@@ -95,7 +95,8 @@ def write_robot(map_: Map, moving: Moving, mean: Array, cov: Array) -> None:
     """Write the first numbers of a robot's state, and the covariance (d, d) of these, independent of all else.
 
     A velocity in the rest of the state stays what it is in the frame of the robot: it turns with its pose.  As a robot
-    that was carried away may have another one, it is less certain by the greatest so far.
+    that was carried away may have another one, it is less certain by the greatest so far.  The constants of its
+    controls and mounts are again as they were stated: they were corrected at another pose.
     """
     x, rows, d = map_.mean(moving.slot), map_.index(moving.slot), len(cov)
     after, F = np.concatenate([mean, x[len(mean) :]]), np.eye(len(rows))
@@ -111,3 +112,6 @@ def write_robot(map_: Map, moving: Moving, mean: Array, cov: Array) -> None:
         Q[d:, d:] = (back * speeds**2) @ back.T
     map_.predict(rows, F, G @ cov @ G.T + Q)
     map_.set_predicted(moving.slot, after)
+    for slot, stated, N in moving.constants:
+        map_.predict(map_.index(slot), np.zeros_like(N), N)
+        map_.set_predicted(slot, stated)

@@ -152,12 +152,15 @@ class State:
         if bias_slot is not None:
             self.tracks.enter_block(bias_name(robot.name), bias_slot)
         held = HeldInput(robot.motion, robot.watch(), robot.rests_until_ns)
-        self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, held)
+        moving = self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, held)
+        if bias is not None and bias_slot is not None:
+            moving.constants.append((bias_slot, *bias[1:]))
         for name, mount in robot.sensors.items():
             mount_slot, block = -1, mount.block(name)
             if block is not None:  # the mount calibrates itself
                 mount_slot = self.map.add(*block)
                 self.tracks.enter_block(mount_name(robot.name, name), mount_slot)
+                moving.constants.append((mount_slot, *block[1:]))
             if isinstance(mount.sensor, OfState):
                 refuse_other_world(self.robots, type(mount.sensor).__name__, world_of(mount.sensor))
                 if measures_blocks(mount.sensor):
@@ -175,7 +178,7 @@ class State:
             )  # fmt: skip
             self.channels[robot.name, name] = channel
             if channel.lags:
-                self.moving[robot.name].past = self.moving[robot.name].past or PastMotion(channel.pose_dof)
+                moving.past = moving.past or PastMotion(channel.pose_dof)
             if isinstance(mount.detector, SearchingDetector):
                 self.sources[robot.name, name] = mount.detector.source(mount.sensor)
             upkeep = mount.upkeep or settings.upkeep
