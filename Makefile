@@ -43,24 +43,13 @@ fuzz: $(VENV)/fuzz.stamp
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/base.stamp: pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
-	touch $@
+EXTRAS_test := [dev]
+EXTRAS_docs := [docs]
+EXTRAS_bench := [peers]
+EXTRAS_fuzz := [fuzz]
 
-$(VENV)/test.stamp: $(VENV)/base.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
-	touch $@
-
-$(VENV)/docs.stamp: $(VENV)/base.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
-	touch $@
-
-$(VENV)/bench.stamp: $(VENV)/base.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[peers]'
-	touch $@
-
-$(VENV)/fuzz.stamp: $(VENV)/base.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[fuzz]'
+$(VENV)/%.stamp: pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.$(EXTRAS_$*)'
 	touch $@
 
 $(VENV)-lowest/stamp: pyproject.toml
