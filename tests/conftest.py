@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 from collections.abc import Callable
@@ -12,6 +13,13 @@ from hypothesis import settings
 
 settings.register_profile("patient", deadline=None)  # a first call may compile
 settings.load_profile("patient")
+
+gc.set_threshold(100_000)  # a tenth of the time of the tests was the garbage collector's
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector leave the modules of all tests alone."""
+    gc.freeze()
 
 
 def _finder(variable: str) -> Callable[[str], Path]:
