@@ -1,5 +1,6 @@
 """The documentation site, built by `make docs`: Sphinx, MyST, the pydata theme and sphinx-gallery, all offline."""
 
+import gc
 import os
 import re
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS / "site"))
 os.environ["MPLBACKEND"] = "Agg"
+gc.set_threshold(100_000)  # a fifth of the time of reading and writing was the garbage collector's
 
 import matplotlib.animation  # noqa: E402
 import sphinx_gallery.notebook  # noqa: E402
