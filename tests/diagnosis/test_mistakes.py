@@ -16,7 +16,7 @@ from kalmark.config import build_slam, config_dict
 from kalmark.config.tree import parse_value
 from kalmark.diagnosis.gross_mistakes import gross, likeliest
 from kalmark.diagnosis.mistakes import Mistake, mistakes
-from kalmark.diagnosis.trials import FITS, MISFIT, Fit, _in_race, fit_of_run, fit_with
+from kalmark.diagnosis.trials import FITS, MISFIT, Fit, Trials, _in_race, fit_of_run
 from kalmark.events import Control, Event, Scan
 from kalmark.logs.log import Log
 from kalmark.logs.log_corrections import correct_log
@@ -111,7 +111,7 @@ def test_beacons_above_the_plane_of_their_robot_are_named_with_their_height(tmp_
     log = log_of(measuring(lambda y: np.sqrt(y**2 + 2.0**2)), settings)
     run = run_of(log, settings)
     heights = {m.cure.split("=")[1]: m for m in mistakes(run.config, run) if m.name == "height"}
-    right, wrong = (fit_with(log, log.events, heights[z_m]) for z_m in ("-2", "-3"))
+    right, wrong = (Trials().fit_with(log, log.events, heights[z_m]) for z_m in ("-2", "-3"))
     assert right.mean < FITS < fit_of_run(run).mean
     assert right.likelihoods.sum() > wrong.likelihoods.sum()
     assert heights["-2"].cure == "--set robots.rover.sensors.radio.mount.z_m=-2"

@@ -18,6 +18,7 @@ from kalmark.diagnosis.batch_search import associated
 from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.onsets import _turns, without_onset
+from kalmark.diagnosis.trials import Trials
 from kalmark.events import Control, Scan
 from kalmark.geometry.frames import compose
 from kalmark.geometry.frames3d import compose as compose3d
@@ -76,7 +77,7 @@ def test_wheels_that_slip_for_a_while_are_named_first_with_both_times(ids: bool)
     assert end_s == pytest.approx(14.0, abs=0.3)
     assert cause.cure == ""
     if not ids:
-        assert associated(run, log_of_run(run)) is not run, "associations of less certain controls"
+        assert associated(run, log_of_run(run), Trials()) is not run, "associations of less certain controls"
 
 
 @pytest.mark.parametrize(
@@ -114,7 +115,7 @@ def test_an_error_is_taken_out_of_its_part_of_a_log_alone(name: str, of: tuple[s
 
 def test_the_associations_of_a_run_that_fits_are_those_it_has() -> None:
     _, run = slipping(False, 0.0, 0.0)
-    assert associated(run, log_of_run(run)) is run
+    assert associated(run, log_of_run(run), Trials()) is run
 
 
 @pytest.mark.parametrize(

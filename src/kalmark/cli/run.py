@@ -140,7 +140,7 @@ def judge(result: Run) -> None:
     except PluginError as error:
         say(f"warning: no verdict: {error}", err=True)
     else:
-        diagnose(result, VERDICT_OBSERVATIONS, progress=True)
+        diagnose(result, VERDICT_OBSERVATIONS, brief=True, progress=True)
 
 
 def finish(result: Run, out: Path, title: str) -> None:

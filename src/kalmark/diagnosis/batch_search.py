@@ -16,7 +16,7 @@ from kalmark.diagnosis import repeated_events
 from kalmark.diagnosis.cause_search import Search
 from kalmark.diagnosis.error_columns import Where
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.trials import filter_events, fit_of_run
+from kalmark.diagnosis.trials import SOLVED, Trials, fit_of_run, work_of
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event
 from kalmark.logs.log import Log
@@ -45,7 +45,7 @@ class Searched(NamedTuple):
     given: BatchInput
 
 
-def search_causes(run: Run, log: Log, most: int, limit: int, progress: bool) -> Searched:
+def search_causes(run: Run, log: Log, most: int, limit: int, trials: Trials) -> Searched:
     """Search for causes in the batch problem of a run.  Raises KalmarkError if it has none.
 
     Where `most` observations do not solve it, more are tried, up to a `limit`: all of a long log take minutes.
@@ -54,26 +54,29 @@ def search_causes(run: Run, log: Log, most: int, limit: int, progress: bool) -> 
     if not every.associations.landmark:
         raise KalmarkError("no observation was of a landmark in the map")
     given = subsample(run, every, most)
+    trials.spend(SOLVED * len(given.associations.landmark))
     try:
         problem = replay_events(given, log)
         batch = optimum(problem, tolerance=NEAR)
     except KalmarkError:
-        if given is not every and min(MORE * most, len(every.associations.landmark)) <= limit:
-            return search_causes(run, log, MORE * most, limit, progress)
+        more = min(MORE * most, len(every.associations.landmark))
+        paid = more <= limit and trials.pays(f"a batch solution of {more} observations", SOLVED * more)
+        if given is not every and paid:
+            return search_causes(run, log, MORE * most, limit, trials)
         raise
     search = Search(Linear.of(problem, batch.state, gated_noise_factors(run)), sensors_of(run), given.t_ns)
-    search.run(progress)
+    search.run(trials.progress)
     return Searched(search, batch, given)
 
 
-def associated(run: Run, log: Log) -> Run:
+def associated(run: Run, log: Log, trials: Trials) -> Run:
     """Return a run, or one of less certain controls if in that more observations are of landmarks, and fit better.
 
     An error of the controls, which are stated too exact, makes a filter take landmarks for new ones, and leave others
     out: then nothing of it is left in the residuals.  The batch problem has the noise that is stated.
     """
     robots, before = run.final_slam().robots, fit_of_run(run)
-    if not run.config.get("robots"):
+    if not run.config.get("robots") or not trials.pays("associations of less certain controls", work_of(log.events)):
         return run
 
     def widened(e: Event) -> Event:
@@ -82,7 +85,7 @@ def associated(run: Run, log: Log) -> Run:
         N = robots[e.robot].motion.control_noise(e.u / e.share) if e.cov is None else e.cov
         return replace(e, cov=WIDER**2 * N)
 
-    wide = filter_events(run.config, log, [widened(e) for e in log.events])
+    wide = trials.filter(run.config, log, [widened(e) for e in log.events])
     if wide is None or fit_of_run(wide).mean >= before.mean or number_associated(wide) <= number_associated(run):
         return run
     return wide

@@ -22,14 +22,13 @@ from kalmark.diagnosis.trials import (
     MOST,
     SURELY,
     Fit,
-    filter_events,
+    Trials,
     first_events,
     first_of,
     fit_of_run,
-    fit_with,
     likelihood_gain,
     log_from,
-    race,
+    work_of,
 )
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry.frames3d import to_euler_pose
@@ -40,6 +39,7 @@ from kalmark.results.measures import Rigid, level, level_sigmas, rmse
 from kalmark.results.run import Run
 from kalmark.results.wrong_starts import restarts
 
+MISTAKES = "units, signs, columns, mounts and times"
 LEAST_SCANS = 80  # and controls, that show by how much scans are late
 MUCH = 3.0  # times better is the log without the mistake
 LEAST_FIXES = 5  # in a row that do not fit: their robot is not where it should be
@@ -47,39 +47,53 @@ WINDOW = 30  # observations, over which is asked whether the log fits from there
 STEPS = (-4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)  # by which scans may be late
 
 
-def gross(run: Run, log: Log, alarmed: bool = False, progress: bool = False) -> tuple[Mistake, Filtered | None] | None:
+def gross(
+    run: Run, log: Log, alarmed: bool = False, trials: Trials | None = None
+) -> tuple[Mistake, Filtered | None] | None:
     """Return the mistake that explains most why a run does not fit, None if it does fit or if none explains it.
 
     It is looked for where something else is `alarmed`, too.  With it comes the log filtered without it, if that was.
     """
     if not run.config.get("robots"):
         return None
-    found = find_wrong_starts(run, log)
+    trials = trials or Trials()
+    found = find_wrong_starts(run, log, trials)
     if found is not None:
         return found, None
     now = fit_of_run(run)
-    of_ids = find_wrong_ids(run, log, now)
+    of_ids = find_wrong_ids(run, log, now, trials)
     explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
     first = None if explained else misfits_from(now)
     fits = now.mean < MISFIT and not run.stopped and first is None
-    alone = None if fits and not alarmed else likeliest(run, log, first, progress)
+    alone = None if fits and not alarmed else likeliest(run, log, first, trials)
     if alone is not None and of_ids is not None and first is None:  # found in the first events, compared in all
-        alone = alone._replace(gain=likelihood_gain(now, fit_with(log, log.events, alone)))
+        if not trials.pays(f"{alone.name}, compared with {of_ids[0].name}", work_of(log.events)):
+            return of_ids
+        alone = alone._replace(gain=likelihood_gain(now, trials.fit_with(log, log.events, alone)))
     if alone is None or (of_ids is not None and alone.gain < of_ids[0].gain):
         return of_ids
     return alone, None
 
 
-def likeliest(run: Run, log: Log, first: int | None = None, progress: bool = False) -> Mistake | None:
+def likeliest(run: Run, log: Log, first: int | None = None, trials: Trials | None = None) -> Mistake | None:
     """Return the mistake without which a log is likeliest, None if it fits as it is or without none.
 
     The log is filtered from the observation `first` on, if it fits before it: then a sensor was turned, or a source
     exchanged.  None, too, if the log is likelier where what is far off is left out: no mistake is then why it is.
     """
+    trials = trials or Trials()
     config, rest = (run.config, log) if first is None else log_from(run, log, first)
     events = first_events(run, rest.events)
     none, off = Mistake("", "", "", config), Mistake(OUTLIERS, "", "", gated(config))
-    made = race(rest, events, [none, off, *changes_of(run, config, events)], progress)
+    changes = [none, off, *changes_of(run, config, events)]
+    share = trials.share_of_race(len(changes), events)
+    if share < 1.0:
+        scans = round(share * sum(isinstance(e, Scan) for e in events))
+        trials.left_out.append(f"{MISTAKES}{f' after {scans} scans' if scans >= LEAST_SCANS else ''}")
+        if scans < LEAST_SCANS:
+            return None
+        events = first_events(run, rest.events, scans)
+    made = trials.race(rest, events, changes)
     least = max((one.gain for one in made if one.name == OUTLIERS), default=0.0)
     made = [one for one in made if one.gain > least]
     sizes = {(one.name, one.of): one for one in sorted(reversed(made), key=lambda one: one.gain)}  # the likeliest
@@ -88,8 +102,9 @@ def likeliest(run: Run, log: Log, first: int | None = None, progress: bool = Fal
         return found
     every = next(one for one in changes_of(run, run.config, events) if found.evidence.startswith(one.evidence))
     before = [e for e in log.events if e.t_ns < events[0].t_ns]
-    as_it_is, changed = (fit_with(log, before, one) for one in (none._replace(config=run.config), every))
-    if likelihood_gain(as_it_is, changed) > -SURELY:
+    both = none._replace(config=run.config), every
+    paid = trials.pays(f"{MISTAKES} before t={found.since_s:.1f} s", 2.0 * work_of(before))
+    if paid and likelihood_gain(*(trials.fit_with(log, before, one) for one in both)) > -SURELY:
         return every._replace(evidence=found.evidence, gain=found.gain, since_s=log.events[0].t_s)
     return found._replace(evidence=f"from t={found.since_s:.1f} s on {found.evidence}", cure="", of=())
 
@@ -123,7 +138,7 @@ def misfits_from(now: Fit) -> int | None:
     return first if values[first:].mean() > MISFIT else None
 
 
-def find_wrong_starts(run: Run, log: Log) -> Mistake | None:
+def find_wrong_starts(run: Run, log: Log, trials: Trials) -> Mistake | None:
     """Return that robots start elsewhere, or turned, if fixes in a row were rejected and then fit.
 
     The path of each robot without fixes and the others, moved about the vertical axis onto its fixes, has the start.
@@ -131,13 +146,15 @@ def find_wrong_starts(run: Run, log: Log) -> Mistake | None:
     events, config, told, begin_s = first_events(run, log), run.config, [], math.inf
     again = restarts(run.history)  # of these the map was moved onto their fixes
     lost = [start for start in run.history.starts if start.robot not in again and _is_lost(run, start.robot)]
+    if not trials.pays("other starts", (1 + len(lost)) * work_of(events) if lost else 0):
+        return None
     for start in lost:
-        found = _onto_its_fixes(run, log, events, start)
+        found = _onto_its_fixes(run, log, events, start, trials)
         if found is not None:
             config, *words = started_at(config, start, *found)
             told.append(words)
             begin_s = min(begin_s, start.t_ns * 1e-9)
-    after = filter_events(config, log, events) if told else None
+    after = trials.filter(config, log, events) if told else None
     if after is None or fit_of_run(after).mean > FITS or any(_is_lost(after, start.robot) for start in lost):
         return None
     gain = likelihood_gain(_fit_of_fixes(run, len(after.history.fixes)), _fit_of_fixes(after))
@@ -145,12 +162,14 @@ def find_wrong_starts(run: Run, log: Log) -> Mistake | None:
     return Mistake("start", evidence, cure, config, None, gain, begin_s)
 
 
-def _onto_its_fixes(run: Run, log: Log, events: list[Event], start: RobotStart) -> tuple[Rigid, Array, float] | None:
+def _onto_its_fixes(
+    run: Run, log: Log, events: list[Event], start: RobotStart, trials: Trials
+) -> tuple[Rigid, Array, float] | None:
     """Return what moves the path of a robot alone onto its fixes, these (N, d), and their variance, m^2.
 
     None if the path fits them nearly as well as it is: then it was another robot that started elsewhere.
     """
-    path = filter_events(run.config, log, list(_alone(events, start.robot, run.history.robots)))
+    path = trials.filter(run.config, log, list(_alone(events, start.robot, run.history.robots)))
     mine = np.zeros(0, np.bool_) if path is None else path.history.robot == start.robot
     if path is None or not mine.any():
         return None

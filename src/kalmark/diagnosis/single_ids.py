@@ -18,7 +18,7 @@ from scipy.special import rel_entr
 
 from kalmark.arrays import Array, Flags
 from kalmark.diagnosis.mistakes import Mistake, with_value
-from kalmark.diagnosis.trials import AT_ONCE, FITS, SURELY, Fit, filter_events, fit_of_run, likelihood_gain, log_from
+from kalmark.diagnosis.trials import AT_ONCE, FITS, SURELY, Fit, Trials, fit_of_run, likelihood_gain, log_from, work_of
 from kalmark.events import Event, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.logs.log import Log
@@ -62,7 +62,7 @@ class Filtered(NamedTuple):
     log: Log
 
 
-def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | None:
+def find_wrong_ids(run: Run, log: Log, now: Fit, trials: Trials) -> tuple[Mistake, Filtered] | None:
     """Return the fault of ids that name more than one place, or of single wrong observations, and the run without them.
 
     Of a log of more than `AT_ONCE` observations that is the part about the first that do not fit.
@@ -73,7 +73,10 @@ def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | N
     whole = len(now.values) <= AT_ONCE
     if not whole:
         config, log, now = _part(run, log, now, far)
-    first = run if whole and config == run.config else filter_events(config, log, log.events)
+    as_it_is = whole and config == run.config
+    if not trials.pays("wrong ids", (1 if as_it_is else 2) * work_of(log.events)):
+        return None
+    first = run if as_it_is else trials.filter(config, log, log.events)
     if first is None:
         return None
     before, h = fit_of_run(first), first.history
@@ -81,7 +84,7 @@ def find_wrong_ids(run: Run, log: Log, now: Fit) -> tuple[Mistake, Filtered] | N
     new = np.flatnonzero(first.history.outcome == "new") if len(before.values) == len(now.values) else None
     gain, mean = likelihood_gain(now, before, new), max(before.mean, 1.0)
     cure = CURE if gain > SURELY * mean else OWN_ID  # a gate helps no more where all of this is left out already
-    found, wrong, more = _places_of_ids(config, log, first, out)
+    found, wrong, more = _places_of_ids(config, log, first, out, trials)
     if not out.any():
         return None
     rest = np.flatnonzero(out & ~np.isin(first.history.id, wrong))
@@ -167,7 +170,7 @@ def _places(slam: Slam, channel: Channel) -> list[tuple[ObservationModel, Texts,
 
 
 def _places_of_ids(
-    config: Mapping[str, Any], log: Log, first: Run, out: Flags
+    config: Mapping[str, Any], log: Log, first: Run, out: Flags, trials: Trials
 ) -> tuple[tuple[Mistake, Run] | None, list[str], float]:
     """Return that ids mean other places, the log filtered with names for these, which, and how much likelier it is."""
     h = first.history
@@ -180,7 +183,7 @@ def _places_of_ids(
     seen = {*h.id[np.argmax(rows) :].tolist()} - {""}
     if not wrong or len(wrong) > MOST * len(seen):
         return None, [], 0.0
-    again = filter_events(config, log, _renamed(log, first, np.flatnonzero(rows), _other))
+    again = trials.filter(config, log, _renamed(log, first, np.flatnonzero(rows), _other))
     if again is None:
         return None, [], 0.0
     h, after = again.history, fit_of_run(again)

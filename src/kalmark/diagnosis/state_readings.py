@@ -23,11 +23,12 @@ from kalmark.diagnosis.trials import (
     MISFIT,
     MOST,
     Fit,
-    filter_events,
+    Trials,
     first_events,
     first_of,
     fit_of_run,
     likelihood_gain,
+    work_of,
 )
 from kalmark.events import Event
 from kalmark.geometry.gaussian import quantile
@@ -43,6 +44,7 @@ from kalmark.results.warnings import CHANCE, NOTICES
 
 SCANS = 800  # of the log are filtered again
 MOST_CAUSES = 3
+CHANGES = 10  # of a sensor, or so
 ROUNDS, SAME = 3, 0.1  # in which a noise is found, and the share by which the last may change it
 WIDER = 2.0  # times larger is a sigma of a constant than the one that is stated, else it is tried already
 SIGMA_SCALE, MOST_SCALE = "sigma_scale", 0.5  # its key, and its sigma where the scale is sought
@@ -92,9 +94,9 @@ class FilteredRun(NamedTuple):
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
 
 
-def filtered_with(config: Mapping[str, Any], log: Log, events: list[Event]) -> FilteredRun | None:
+def filtered_with(trials: Trials, config: Mapping[str, Any], log: Log, events: list[Event]) -> FilteredRun | None:
     """Return the fit of events under a configuration, None if they are refused."""
-    run = filter_events(config, log, events)
+    run = trials.filter(config, log, events)
     return None if run is None else fit_of_readings(run)
 
 
@@ -107,9 +109,10 @@ class _Sensor:
     """A sensor of the state, and the trials with it: events under a configuration, filtered as they are."""
 
     def __init__(
-        self, as_it_is: FilteredRun, config: Mapping[str, Any], log: Log, events: list[Event], of: Where
+        self, engine: Trials, as_it_is: FilteredRun, config: Mapping[str, Any], log: Log, events: list[Event], of: Where
     ) -> None:
-        self.as_it_is, self.config, self.log, self.events, self.where = as_it_is, config, log, events, of
+        self.engine, self.as_it_is, self.config, self.log, self.events = engine, as_it_is, config, log, events
+        self.where = of
         run = as_it_is.run
         self.sensor: Any = run.final_slam().robots[of[0]].sensors[of[1]].sensor
         self.space = run.history.in_space
@@ -139,7 +142,7 @@ class _Sensor:
         turned = None if change is None else change_measurements({self.where}, change)
         events = self.events if turned is None else [turned(e) for e in self.events]
         scaled = by is not None and bool((np.abs(by) != 1.0).any())
-        after = filtered_with(config, self.log, events)
+        after = filtered_with(self.engine, config, self.log, events)
         if after is None:
             return None
         gain = self.gain(after, scaled)
@@ -176,7 +179,7 @@ class _Sensor:
             config = self.config
             for k in keys:
                 config = with_value(config, (*self.path, k), configured_value(self.config, (*self.path, k)) * times)
-            found = filtered_with(config, self.log, self.events)
+            found = filtered_with(self.engine, config, self.log, self.events)
             if found is None:
                 return None
             now = found
@@ -271,22 +274,26 @@ def _same(told: tuple[str, str], _: FilteredRun) -> tuple[str, str]:
     return told
 
 
-def reasons(run: Run, log: Log, progress: bool = False) -> tuple[list[Mistake], FilteredRun | None]:
+def reasons(run: Run, log: Log, engine: Trials | None = None) -> tuple[list[Mistake], FilteredRun | None]:
     """Return the faults of sensors of the state in a run that does not fit, and the fit of the log without them.
 
     Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.
     """
     if not run.config.get("robots") or run.stopped:
         return [], None
-    config, events, found = dict(run.config), first_events(run, log, SCANS), list[Mistake]()
-    now = filtered_with(config, log, events)
+    engine, config, events, found = engine or Trials(), dict(run.config), first_events(run, log, SCANS), list[Mistake]()
+    number = CHANGES * len(fit_of_readings(run).tried())
+    if not engine.pays("sensors of the state", number * work_of(events)):
+        return [], None
+    now = filtered_with(engine, config, log, events)
     while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
-        of = [_Sensor(now, config, log, events, where) for where in now.tried()]
-        trials = track((m for sensor in of for m in sensor.trials()), "sensors of the state, tried", show=progress)
+        of = [_Sensor(engine, now, config, log, events, where) for where in now.tried()]
+        tried = (m for sensor in of for m in sensor.trials())
+        trials = track(tried, "sensors of the state, tried", show=engine.progress)
         first = first_of(sorted((m for m in trials if m is not None), key=lambda m: -m.gain))
         if first is None:
             break
         found.append(first)
         config, events = dict(first.config), [*map(first.change, events)] if first.change else events
-        now = filtered_with(config, log, events)
+        now = filtered_with(engine, config, log, events)
     return found, now

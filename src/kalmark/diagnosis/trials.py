@@ -1,7 +1,8 @@
 """Trials: a log filtered again as if something were not wrong with it, and how much likelier the same observations are.
 
 An observation that a change leaves unused counts as one at the cap, as it does without the change: no change gains by
-observations that it leaves out.
+observations that it leaves out.  All that filters or solves the batch problem again has one budget of work: a search
+that it cannot pay is left out whole, and named.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from kalmark.config.tree import Tree, parse_value
 from kalmark.diagnosis.cause_texts import OR
 from kalmark.diagnosis.mistakes import Mistake, configured_value, robot_section, with_value
 from kalmark.errors import KalmarkError, LogError
-from kalmark.events import Event, Scan, sort_key
+from kalmark.events import Event, Frame, Raw, Scan, sort_key
 from kalmark.logs.log import Log
 from kalmark.logs.log_corrections import correct_log
 from kalmark.logs.progress import track
-from kalmark.report import ALONE
+from kalmark.report import ALONE, Report
 from kalmark.results.control_gaps import while_lost
 from kalmark.results.history import History, Ints
 from kalmark.results.record import Recorder
@@ -42,7 +43,16 @@ MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
 FITS = 2.0  # below which a log fits
 LOST = 9.0  # what an observation without an id counts that is of no landmark in the map: as one at the gate
 AT_ONCE = 20_000  # observations of a log that are filtered again, or solved for
-SHARES = tuple(1.5**-k for k in range(5, -1, -1))  # of the events, after which changes are compared
+SHARES = tuple(1.5**-k for k in range(7, -1, -1))  # of the events, after which changes are compared
+CONTROL, SCAN, OBSERVATION, IMAGE = 3, 24, 1, 1000  # the work of filtering each, in observations with ids: 1/30 ms
+WITHOUT_ID = 4  # times as much work is a scan without ids
+SOLVED = 10  # the work of a batch solution and the search in it, for each observation
+BRIEF, SHARE = 300_000, 0.3  # the work of a verdict at the end of a run, 10 s: so much, or this share of the run's own
+RACED, RACE = (
+    0.5,
+    4,
+)  # of the budget that is left, what a race may take; how often it filters the events but first parts
+THOROUGH = 50  # times as much is that of a verdict that was asked for
 MOST = 25.0  # that one observation counts, and what counts one that was left out
 ALIKE = 0.95  # of the gain of the likeliest change: the log does not distinguish them
 SURELY = 50.0  # the gain of what is 10 sigma off
@@ -113,11 +123,88 @@ def _likelihoods(h: History, dof: Ints, shrunk: Mapping[tuple[str, str], float])
     return np.maximum(fits, anywhere)
 
 
+class Trials:
+    """The filter of the changed logs of a verdict, and the budget of their work.
+
+    `work` is a count, the same on every machine: of events, observations (`work_of`) and filters, as a robot that may
+    be in several places has one for each.  `left_out` has the searches that were not paid, in words.
+    """
+
+    def __init__(self, work: float = math.inf, progress: bool = False) -> None:
+        self.work, self.progress, self.left_out = work, progress, list[str]()
+
+    @classmethod
+    def of(cls, log: Log, brief: bool, progress: bool) -> Trials:
+        """Return the trials of a verdict on the run of a log: `brief` at its end, else as it was asked for."""
+        work = max(BRIEF, SHARE * work_of(log.events))
+        return cls(work if brief else THOROUGH * work, progress)
+
+    def pays(self, what: str, work: float) -> bool:
+        """Return whether a search of so much work is in the budget; name it if it is not."""
+        if work > self.work and what not in self.left_out:
+            self.left_out.append(what)
+        return work <= self.work
+
+    def spend(self, work: float) -> None:
+        """Take work that was done off the budget."""
+        self.work -= work
+
+    def filter(self, config: Mapping[str, Any], log: Log, events: Iterable[Event]) -> Run | None:
+        """Return the run of events under a configuration, None if they are refused."""
+        return Trial(self, log, events, Mistake("", "", "", config)).run()
+
+    def fit_with(self, log: Log, events: Iterable[Event], change: Mistake) -> Fit:
+        """Return the fit of some events of a log with a change."""
+        trial = Trial(self, log, events, change)
+        trial.run()
+        return trial.fit
+
+    def share_of_race(self, number: int, events: Iterable[Event]) -> float:
+        """Return the share of some events in which the budget pays a race of so many changes."""
+        return min(1.0, RACED * self.work / ((RACE + SHARES[0] * number) * max(work_of(events), 1)))
+
+    def race(self, log: Log, events: list[Event], changes: Sequence[Mistake]) -> list[Mistake]:
+        """Return the changes with which events fit, and are surely likelier than with the first, with their gains.
+
+        All are filtered at once, in growing parts of the events; what cannot win any more is dropped (`_in_race`), and
+        of the rest go on, at least one, the likeliest that the budget pays.
+        """
+        end = (1.0 - RACED) * self.work
+        none, *left = (Trial(self, log, events, change) for change in changes)
+        now, whole, before = UNUSED if none.run() is None else none.fit, work_of(events), 0.0
+        left = left if _misfit(now) > SURELY else []
+        for share in SHARES:
+            most = max(1, int((self.work - end) / (whole * (share - before))))
+            likeliest = sorted(left, key=lambda one: -likelihood_gain(now, one.fit))[:most]
+            left = [one for one in left if one in likeliest]
+            for one in track(left, f"mistakes in {share:.0%} of the first events", show=self.progress):
+                one.run(share)
+            left = [one for one in left if len(one.fit.values)]
+            left = [left[k] for k in _in_race(now, [one.fit for one in left], 1.0 / share - 1.0)]
+            before = share
+        made = [(one.change, likelihood_gain(now, one.fit)) for one in left]
+        return [change._replace(gain=gain, since_s=events[0].t_s) for change, gain in made]
+
+
+def work_of(events: Iterable[Event]) -> int:
+    """Return the work of filtering events."""
+    return sum(map(_work, events))
+
+
+def _work(event: Event) -> int:
+    if isinstance(event, Scan):
+        known = event.ids is not None and None not in event.ids
+        return (SCAN + OBSERVATION * len(event.y)) * (1 if known else WITHOUT_ID)
+    if isinstance(event, Raw):
+        return (SCAN + OBSERVATION * DETECTED) * WITHOUT_ID
+    return IMAGE if isinstance(event, Frame) else CONTROL
+
+
 class Trial:
     """Events of a log that are filtered with a change, part by part, and the fit of their observations so far."""
 
-    def __init__(self, log: Log, events: Iterable[Event], change: Mistake) -> None:
-        self.change, self.taken, self.fit = change, 0, REFUSED
+    def __init__(self, trials: Trials, log: Log, events: Iterable[Event], change: Mistake) -> None:
+        self.trials, self.change, self.taken, self.fit = trials, change, 0, REFUSED
         self.events = sorted(map(change.change, events), key=sort_key) if change.change else [*events]
         self.recorder: Recorder | None = None
         with suppress(KalmarkError, np.linalg.LinAlgError):
@@ -130,7 +217,9 @@ class Trial:
         begin, self.taken, self.fit = self.taken, round(share * len(self.events)), REFUSED
         with suppress(KalmarkError, np.linalg.LinAlgError):
             if self.recorder is not None:
-                self.recorder.take(self.events[begin : self.taken], "skip")
+                part = self.events[begin : self.taken]
+                shown = track(part, "the log, filtered again", len(part), show=self.trials.progress)
+                self.recorder.take(shown, "skip", [self._spend])
                 run = self.recorder.run(0.0)
                 if not run.stopped and len(run.skipped) <= FEW_SKIPPED * len(self.events):
                     self.fit = fit_of_run(run, self.change.shrunk)
@@ -138,22 +227,10 @@ class Trial:
         self.recorder = None
         return None
 
-
-def race(log: Log, events: list[Event], changes: Sequence[Mistake], progress: bool = False) -> list[Mistake]:
-    """Return the changes with which events fit, and are surely likelier than with the first of them, with their gains.
-
-    All are filtered at once, in growing parts of the events; what cannot win any more is dropped (`_in_race`).
-    """
-    none, *left = (Trial(log, events, change) for change in changes)
-    now = UNUSED if none.run() is None else none.fit
-    left = left if _misfit(now) > SURELY else []
-    for share in SHARES:
-        for one in track(left, f"mistakes in {share:.0%} of the first events", show=progress):
-            one.run(share)
-        left = [one for one in left if len(one.fit.values)]
-        left = [left[k] for k in _in_race(now, [one.fit for one in left], 1.0 / share - 1.0)]
-    made = [(one.change, likelihood_gain(now, one.fit)) for one in left]
-    return [change._replace(gain=gain, since_s=events[0].t_s) for change, gain in made]
+    def _spend(self, event: Event, report: Report) -> None:
+        if self.recorder is not None:
+            parts = sum(len(of.parts.log_weights) for of in self.recorder.slam.state.sums.values())
+            self.trials.spend(_work(event) * (1 + parts))
 
 
 def _in_race(none: Fit, fits: Sequence[Fit], rest: float) -> Ints:
@@ -180,18 +257,6 @@ def _in_race(none: Fit, fits: Sequence[Fit], rest: float) -> Ints:
 def _misfit(of: Fit, begin: int = 0, end: int | None = None) -> float:
     """Return by how much some observations are less likely than such that fit."""
     return 0.5 * float(((of.values - 1.0) * of.dof)[begin:end].sum())
-
-
-def filter_events(config: Mapping[str, Any], log: Log, events: list[Event]) -> Run | None:
-    """Return the run of events under a configuration, None if they are refused."""
-    return Trial(log, events, Mistake("", "", "", config)).run()
-
-
-def fit_with(log: Log, events: Iterable[Event], change: Mistake) -> Fit:
-    """Return the fit of some events of a log with a change."""
-    trial = Trial(log, events, change)
-    trial.run()
-    return trial.fit
 
 
 def first_of(made: Sequence[Mistake]) -> Mistake | None:

@@ -21,7 +21,7 @@ from kalmark.diagnosis.blind import blind
 from kalmark.diagnosis.cause_search import Search, joined
 from kalmark.diagnosis.cause_texts import finding_text, odd_control_text
 from kalmark.diagnosis.causes import JUMPS, LEAST_GAIN, TIMES, Finding
-from kalmark.diagnosis.gross_mistakes import gross, started_at
+from kalmark.diagnosis.gross_mistakes import gross, misfits_from, started_at
 from kalmark.diagnosis.jumps import LISTED, Controls, merge_jumps
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.lost import find_lost_robots, unchecked_ends
@@ -34,11 +34,13 @@ from kalmark.diagnosis.trials import (
     FITS,
     LOST,
     MOST,
-    filter_events,
+    SOLVED,
+    Trials,
     fit_of_run,
     is_configured,
     likelihood_gain,
     with_cure,
+    work_of,
 )
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.errors import KalmarkError
@@ -76,6 +78,7 @@ STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped a
 MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
 AGAIN = "the log filtered again without the mistake"  # what a verdict was made of
 JUMP = "odometry_jump"  # the cause of controls that state a motion that did not take place
+MISFITTING = "from some time on the observations do not fit"
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause of innovations that do not fit, without an explanation
 SEVERITY = dict.fromkeys((*JUMPS, "map_repeats", "lost"), WRONG) | {COPIES: OK}  # the others: doubtful
@@ -110,7 +113,8 @@ class Verdict:
     `sigma_factor` is what the filter's sigmas are to be multiplied by, `accuracy_m` the sigma of a landmark's position
     after it in the world and `shape_accuracy_m` that without the motion of the world that the start leaves open
     (`kalmark.results.gauge`), all the median over landmarks; `shift_m` is by how much the shape of the map changes
-    without the causes.  `checked` names the data behind all this, `search` has the details.
+    without the causes.  `checked` names the data behind all this, `left_out` the searches that were not made, as they
+    take too long for a brief verdict; `search` has the details.
 
     >>> from kalmark.diagnosis.verdict import Cause
     >>> verdict = Verdict("doubtful", (Cause("range_scale", 0.0, 41.0, "ranges too long"),), checked="900 ranges")
@@ -127,19 +131,21 @@ class Verdict:
     shift_m: float | None = None
     robots: dict[str, str] = field(default_factory=dict)
     search: Search | None = field(default=None, repr=False)
+    left_out: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the verdict as it is in ``summary.json``."""
         keys = "map", "robots", "sigma_factor", "accuracy_m", "shape_accuracy_m", "shift_m", "checked"
-        figures = {key: getattr(self, key) for key in keys}
+        figures = {key: getattr(self, key) for key in keys} | {"left_out": [*self.left_out]}
         return figures | {"causes": [vars(cause) for cause in self.causes]}
 
 
-def diagnose(run: Run, most: int = AT_ONCE, *, progress: bool = False) -> Verdict:
+def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bool = False) -> Verdict:
     """Return the verdict on a run, from about so many of its observations; it is kept in the run's summary.
 
-    It reads the log without its truth (`blind`).  With `progress`, standard error shows a bar.  Raises
-    KalmarkError if the log of the run cannot be read again.
+    It reads the log without its truth (`blind`).  A `brief` one has a fiftieth of the work for searches that filter the
+    log again (`kalmark.diagnosis.trials`): `left_out` of the verdict names those that it cannot pay.  With `progress`,
+    standard error shows a bar.  Raises KalmarkError if the log of the run cannot be read again.
 
     >>> from kalmark.config import build_slam
     >>> from kalmark.simulate import load_world, simulate
@@ -152,7 +158,10 @@ def diagnose(run: Run, most: int = AT_ONCE, *, progress: bool = False) -> Verdic
     """
     run.run_plugins()
     seen, log = blind(run)
-    found = _of_causes(seen, log, most, progress)
+    trials = Trials.of(log, brief, progress)
+    found = _of_causes(seen, log, most, trials)
+    if trials.left_out:
+        found = _with_left_out(seen, found, trials)
     causes = [replace(cause, cure="") if is_configured(run.config, cause.cure) else cause for cause in found.causes]
     verdict = _with_signs(seen, replace(found, causes=tuple(causes)))
     if not run.summary:
@@ -165,35 +174,47 @@ def diagnose(run: Run, most: int = AT_ONCE, *, progress: bool = False) -> Verdic
     return verdict
 
 
-def _of_causes(run: Run, log: Log, most: int, progress: bool) -> Verdict:
+def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:
+    """Return a verdict that names the searches which the budget did not pay: no map is ok that then does not fit."""
+    now, causes = fit_of_run(run), verdict.causes
+    if verdict.map == OK and (now.mean > MISFITS_ALL or misfits_from(now) is not None):
+        line = next(iter((*window_warnings(run), *_all_misfit(run))), MISFITTING)
+        verdict = replace(verdict, map=DOUBTFUL, causes=(Cause(MISFIT, begin_s(run), 0.0, line), *causes))
+    return replace(verdict, left_out=tuple(trials.left_out))
+
+
+def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
     """Return the verdict by what is found in the log: what explains most is taken out, and the rest is judged so."""
-    off, explained = readings_off(run, log, progress)
+    off, explained = readings_off(run, log, trials)
     first = _structural(run, log, off)
     alarmed = any(not cause.harmless for cause in first)
-    found = None if explained else gross(run, log, alarmed, progress)
+    found = None if explained else gross(run, log, alarmed, trials)
     if found is None:
-        return _with_cure(run, log, _judged(run, log, first, most, progress), alarmed, most, progress)
+        return _with_cure(run, log, _judged(run, log, first, most, trials), alarmed, most, trials)
     mistake, without = found
     cause = _of_mistake(mistake)
     if mistake.of:
         error = Finding(mistake.name, mistake.of, mistake.gain, 0.0, mistake.value, unit=mistake.unit)
-        return _with_cure(run, log, _judged(run, log, first, most, progress), alarmed, most, progress, error)
+        verdict = _with_cure(run, log, _judged(run, log, first, most, trials), alarmed, most, trials, error)
+        if _cure_of(error) not in trials.left_out or mistake.name in [c.name for c in verdict.causes]:
+            return verdict
+        return replace(verdict, map=worst_status(verdict.map, DOUBTFUL), causes=(cause, *verdict.causes))
     if without is None:
         return Verdict(WRONG, (cause, *(c for c in first if c.name in (COPIES, "gap") or c in off)), AGAIN)
-    verdict = _judged(run, log, first, most, progress)
-    cured = _with_cure(run, log, verdict, alarmed, most, progress, least=mistake.gain)
+    verdict = _judged(run, log, first, most, trials)
+    cured = _with_cure(run, log, verdict, alarmed, most, trials, least=mistake.gain)
     others = verdict.search is not None and OUTLIERS not in [c.name for c in verdict.causes]
     untried = max((f.gain for f in _steady(verdict.search) if not _own_cure(run, f)), default=0.0)
     if cured is not verdict or untried > mistake.gain or (mistake.name == OUTLIERS and others):  # it explains more
         return cured
     bent, off_m = _bent(run, without.run)
-    rest = _judged(*without, _structural(*without, off), most, progress)
+    rest = _judged(*without, _structural(*without, off), most, trials)
     shift_m = max(rest.shift_m or 0.0, off_m)
     return replace(rest, map=worst_status(bent, rest.map), causes=(cause, *rest.causes), shift_m=shift_m)
 
 
 def _with_cure(
-    run: Run, log: Log, verdict: Verdict, alarmed: bool, most: int, progress: bool, *also: Finding,
+    run: Run, log: Log, verdict: Verdict, alarmed: bool, most: int, trials: Trials, *also: Finding,
     least: float = 0.0,
 ) -> Verdict:  # fmt: skip
     """Return a verdict in which the small errors with which the log is likeliest are taken out by their cures.
@@ -204,21 +225,24 @@ def _with_cure(
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
     doubted |= any(f.name == LATE or f.begins for f in suspects)  # whose sizes are so far from linear
-    if len(run.history.d2) > AT_ONCE or not doubted:
+    if not doubted:
         return verdict
-    tried: Iterable[Finding] = chain(also, suspects, _of_less_certain_controls(run, log, most, progress))
+    if len(run.history.d2) > AT_ONCE:
+        trials.left_out.append(f"cures in a log of more than {AT_ONCE} observations")
+        return verdict
+    tried: Iterable[Finding] = chain(also, suspects, _of_less_certain_controls(run, log, most, trials))
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
     for _ in range(ROUNDS):
-        gain, without, changed, one = _likeliest_cure(*at, tried)
+        gain, without, changed, one = _likeliest_cure(*at, tried, trials)
         if one is None or gain < LEAST_GAIN:
             break
         have = [taken[key]] if (key := (one.name, *one.of, str(one.since_s))) in taken else []
         taken[key] = joined([*have, replace(one, gain=gain)])
         at = without, changed
-        rest = _judged(*at, _structural(*at, []), most, progress)
+        rest = _judged(*at, _structural(*at, []), most, trials)
         tried = _suspects(rest.search, 1)
         if fit_of_run(without).mean > MISFITS_ALL:
-            tried = chain(tried, _of_less_certain_controls(*at, most, progress))
+            tried = chain(tried, _of_less_certain_controls(*at, most, trials))
     if not taken or sum(one.gain for one in taken.values()) < least:
         return verdict
     causes = [_cause(run, f, log) for f in sorted(taken.values(), key=lambda f: -f.gain)]
@@ -230,7 +254,9 @@ def _with_cure(
     return replace(verdict, map=status, causes=(*before, *causes, *after))
 
 
-def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding]) -> tuple[float, Run, Log, Finding | None]:
+def _likeliest_cure(
+    run: Run, log: Log, tried: Iterable[Finding], trials: Trials
+) -> tuple[float, Run, Log, Finding | None]:
     """Return the cure with which the log of a run is likeliest, as `without_error`.
 
     After one with which a log fits that did not, only other sizes of that error are tried.
@@ -239,18 +265,18 @@ def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding]) -> tuple[float
     fitted, named = fit_of_run(run).mean < FITS, ""
     for finding in tried:
         if named in ("", finding.name):
-            best = max(best, without_error(run, log, finding), key=lambda of: of[0])
+            best = max(best, without_error(run, log, finding, trials), key=lambda of: of[0])
         if not fitted and best[3] is not None and fit_of_run(best[1]).mean < FITS:
             named = best[3].name
     return best
 
 
-def _of_less_certain_controls(run: Run, log: Log, most: int, progress: bool) -> Iterator[Finding]:
+def _of_less_certain_controls(run: Run, log: Log, most: int, trials: Trials) -> Iterator[Finding]:
     """Yield the systematic errors that a search finds by associations of less certain controls."""
-    wide = associated(run, log)
+    wide = associated(run, log, trials)
     if wide is not run:
         with suppress(KalmarkError, np.linalg.LinAlgError):
-            search = search_causes(wide, log, most, max(AT_ONCE, MORE * most), progress).search
+            search = search_causes(wide, log, most, max(AT_ONCE, MORE * most), trials).search
             yield from [f for f in _steady(search) if f.unit != TIMES][:TRIED]
 
 
@@ -268,19 +294,25 @@ def _steady(search: Search | None) -> list[Finding]:
     return sorted(steady, key=lambda f: -f.gain)
 
 
+def _cure_of(finding: Finding) -> str:
+    """Return the words for the trial of the cure of a finding."""
+    return f"the cure of {finding.name}"
+
+
 def _own_cure(run: Run, finding: Finding) -> str:
     """Return the line that cures a finding, without those of others that explain as much."""
     return finding_text(replace(finding, alike=()), run.config)[1]
 
 
-def without_error(run: Run, log: Log, finding: Finding) -> tuple[float, Run, Log, Finding]:
+def without_error(run: Run, log: Log, finding: Finding, trials: Trials) -> tuple[float, Run, Log, Finding]:
     """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that."""
     if finding.begins:
         changed = without_onset(run, log, finding)
         made = None if changed is None else (run.config, changed, list(changed.events))
     else:
         made = with_cure(run.config, log, _own_cure(run, finding))
-    after = None if made is None else filter_events(*made)
+    paid = made is not None and trials.pays(_cure_of(finding), work_of(made[2]))
+    after = trials.filter(*made) if made is not None and paid else None
     if made is None or after is None:
         return 0.0, run, log, finding
     return likelihood_gain(fit_of_run(run), fit_of_run(after)), after, made[1], finding
@@ -347,13 +379,14 @@ def status_of(causes: Iterable[Cause]) -> str:
     return worst_status(*(SEVERITY.get(cause.name, DOUBTFUL) for cause in causes if not cause.harmless))
 
 
-def _judged(run: Run, log: Log, first: list[Cause], most: int, progress: bool) -> Verdict:
+def _judged(run: Run, log: Log, first: list[Cause], most: int, trials: Trials) -> Verdict:
     """Return the verdict by the batch solution, by the innovations alone where there is none."""
     limit = max(AT_ONCE, MORE * most)
     if len(run.landmarks) <= most // SEEN and any(not cause.harmless for cause in first):
-        most = max(most, AT_ONCE)  # its reason may show in all of the log only
+        every = min(max(most, AT_ONCE), len(run.history.d2))  # its reason may show in all of the log only
+        most = max(most, every) if trials.pays(f"a batch solution of {every} observations", SOLVED * every) else most
     try:
-        return _by_batch(run, log, first, search_causes(run, log, most, limit, progress))
+        return _by_batch(run, log, first, search_causes(run, log, most, limit, trials))
     except (KalmarkError, np.linalg.LinAlgError):
         found = [Cause(MISFIT, begin_s(run), 0.0, line) for line in (*window_warnings(run), *_all_misfit(run))]
     status = worst_status(status_of(first), DOUBTFUL if found else OK)
@@ -573,7 +606,7 @@ def fits_nothing(run: Run) -> Iterator[Cause]:
         yield Cause(MISFIT, begin_s(run), 0.5 * LOST * float(mine.sum()), f"only {evidence}", cure)
 
 
-def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]:
+def readings_off(run: Run, log: Log, trials: Trials) -> tuple[list[Cause], bool]:
     """Return the faults of sensors of the state, those that still do not fit, and whether that explains the run.
 
     They are further off than their noise and that of the pose allow.  More noise explains nothing with certainty.
@@ -581,7 +614,7 @@ def readings_off(run: Run, log: Log, progress: bool) -> tuple[list[Cause], bool]
     now = fit_of_readings(run)
     if not now.off() and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL):
         return [], False
-    found, after = reasons(run, log, progress)
+    found, after = reasons(run, log, trials)
     causes = [replace(_of_mistake(cause), since_s=begin_s(run)) for cause in found]
     left = {*after.off()} if found and after is not None else {*now.off()}
     for robot, sensor in (of for of in now.off() if of in left):

@@ -25,6 +25,9 @@ def verdict_lines(verdict: Summary, shown: int | None = SHOWN) -> Iterator[str]:
         yield f"{cause['name']}: {cause['evidence']}{'; ' + cause['cure'] if cause['cure'] else ''}"
     if len(some) < len(causes):
         yield f"{count(len(causes) - len(some), 'more cause')}: kalmark diagnose"
+    if verdict.get("left_out"):
+        more = "" if shown is None else "; kalmark diagnose RUN looks further"
+        yield f"not looked at: {', '.join(verdict['left_out'])}{more}"
 
 
 def alarm(verdict: Summary | None) -> list[str]:

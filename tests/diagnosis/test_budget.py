@@ -1,0 +1,120 @@
+"""Is the work of a verdict counted and bounded, and does it name what it left out?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+import kalmark as km
+from kalmark.config import build_slam, config_dict
+from kalmark.diagnosis import trials
+from kalmark.diagnosis.gross_mistakes import likeliest
+from kalmark.diagnosis.trials import CONTROL, OBSERVATION, SCAN, THOROUGH, WITHOUT_ID, Trials, work_of
+from kalmark.diagnosis.verdict import Verdict
+from kalmark.events import Control, Scan
+from kalmark.logs.log import Log
+from kalmark.results.record import Recorder
+from kalmark.results.run import Run
+from kalmark.results.verdict_text import verdict_lines
+from kalmark.simulate import load_world, simulate
+
+FIELD = ("world.count=16", "world.size_m=16", "steps=160", "robots.rover.start={x_m: 8, y_m: 8, theta_rad: 0}",
+         "robots.rover.sensors.lidar.fov_rad=6.2832")  # fmt: skip
+
+
+def run_of(mirrored: bool) -> tuple[Run, Log]:
+    """Return the run of a log whose bearings may have the wrong sign, and that log."""
+    world = load_world("random_field", FIELD)
+    log, config = simulate(world, 4), world.config()
+    sign = -1.0 if mirrored else 1.0
+    events = [replace(e, y=e.y * [1.0, sign]) if isinstance(e, Scan) else e for e in log.events]
+    log = replace(log, events=events, truth={})
+    return km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False), log
+
+
+def poor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave a brief verdict its share of the run's own work alone."""
+    monkeypatch.setattr(trials, "BRIEF", 0)
+
+
+def test_the_work_of_events_is_a_count() -> None:
+    control = Control(t_s=0.0, robot="r", u=(1.0, 0.0))
+    known, unknown = (Scan(t_s=0.0, robot="r", sensor="s", y=[[1.0, 0.0]] * 3, ids=ids) for ids in ([1, 2, 3], None))
+    assert work_of([control]) == CONTROL
+    assert work_of([known]) == SCAN + 3 * OBSERVATION
+    assert work_of([control, unknown]) == CONTROL + WITHOUT_ID * (SCAN + 3 * OBSERVATION)
+
+
+def test_a_filter_takes_the_work_of_its_events_off_the_budget() -> None:
+    run, log = run_of(False)
+    engine = Trials(1e9)
+    assert engine.filter(run.config, log, log.events) is not None
+    assert 1e9 - engine.work == work_of(log.events)
+
+
+def test_a_search_that_the_budget_does_not_pay_is_named_once() -> None:
+    engine = Trials(100)
+    assert engine.pays("cheap", 100) and not engine.left_out
+    assert not engine.pays("dear", 101) and not engine.pays("dear", 200)
+    assert engine.left_out == ["dear"]
+
+
+def test_a_verdict_that_was_asked_for_has_a_far_larger_budget() -> None:
+    _, log = run_of(False)
+    assert Trials.of(log, brief=False, progress=False).work == THOROUGH * Trials.of(log, True, False).work
+    many = replace(log, events=[*log.events] * 1000)
+    assert Trials.of(many, True, False).work == pytest.approx(0.3 * work_of(many.events))
+
+
+def test_a_clean_log_is_ok_and_nothing_of_it_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    poor(monkeypatch)
+    verdict = km.diagnose(run_of(False)[0], 3000, brief=True)
+    assert (verdict.map, verdict.left_out) == ("ok", ())
+
+
+def test_what_a_brief_verdict_leaves_out_is_told_and_no_ok(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = run_of(True)[0]
+    poor(monkeypatch)
+    brief = km.diagnose(run, 3000, brief=True)
+    assert brief.map != "ok" and "units, signs, columns, mounts and times" in brief.left_out
+    assert run.summary["verdict"]["left_out"] == [*brief.left_out]
+    *_, last = verdict_lines(brief.as_dict())
+    assert last.startswith("not looked at: ") and last.endswith("; kalmark diagnose RUN looks further")
+    asked = km.diagnose(run)
+    assert (asked.map, asked.causes[0].name, asked.left_out) == ("wrong", "bearing_sign", ())
+
+
+def test_a_map_whose_log_does_not_fit_is_not_ok_where_its_reason_was_not_looked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run = run_of(True)[0]
+    poor(monkeypatch)
+    monkeypatch.setattr("kalmark.diagnosis.verdict._of_causes", lambda run, log, most, engine: left_out(engine))
+    verdict = km.diagnose(run, brief=True)
+    assert verdict.map == "doubtful" and verdict.causes[0].name == "misfit"
+
+
+def left_out(engine: Trials) -> Verdict:
+    engine.left_out.append("all")
+    return Verdict("ok", (), "nothing")
+
+
+def test_a_race_keeps_to_its_share_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The likeliest changes go on: with a fifth of the work the mistake is found as well."""
+    run, log = run_of(True)
+    engine = Trials(8.0 * work_of(log.events))
+    taken, take = [], Recorder.take
+
+    def counted(self: Recorder, events: Sequence[Any], *more: Any) -> None:
+        part = [*events]
+        taken.append(work_of(part))
+        take(self, part, *more)
+
+    monkeypatch.setattr(Recorder, "take", counted)
+    mistake = likeliest(run, log, None, engine)
+    assert mistake is not None and mistake.name == "bearing_sign"
+    assert engine.left_out == ["units, signs, columns, mounts and times after 124 scans"]
+    assert sum(taken) == 8.0 * work_of(log.events) - engine.work < 5.0 * work_of(log.events)
