@@ -20,6 +20,9 @@ from kalmark.diagnosis.trials import (
     FITS,
     MISFIT,
     MOST,
+    RACE,
+    RACED,
+    SHARES,
     SURELY,
     Fit,
     Trials,
@@ -86,13 +89,10 @@ def likeliest(run: Run, log: Log, first: int | None = None, trials: Trials | Non
     events = first_events(run, rest.events)
     none, off = Mistake("", "", "", config), Mistake(OUTLIERS, "", "", gated(config))
     changes = [none, off, *changes_of(run, config, events)]
-    share = trials.share_of_race(len(changes), events)
-    if share < 1.0:
-        scans = round(share * sum(isinstance(e, Scan) for e in events))
-        trials.left_out.append(f"{MISTAKES}{f' after {scans} scans' if scans >= LEAST_SCANS else ''}")
-        if scans < LEAST_SCANS:
-            return None
-        events = first_events(run, rest.events, scans)
+    filters, parts = RACE + SHARES[0] * len(changes), 2 * len(changes)
+    events = trials.payable(MISTAKES, run, events, filters, parts, share=RACED)
+    if not events:
+        return None
     made = trials.race(rest, events, changes)
     least = max((one.gain for one in made if one.name == OUTLIERS), default=0.0)
     made = [one for one in made if one.gain > least]

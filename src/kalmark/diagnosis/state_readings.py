@@ -43,6 +43,7 @@ from kalmark.results.self_calibration import mount_figures
 from kalmark.results.warnings import CHANCE, NOTICES
 
 SCANS = 800  # of the log are filtered again
+READINGS = "sensors of the state"
 MOST_CAUSES = 3
 CHANGES = 10  # of a sensor, or so
 ROUNDS, SAME = 3, 0.1  # in which a noise is found, and the share by which the last may change it
@@ -281,12 +282,13 @@ def reasons(run: Run, log: Log, engine: Trials | None = None) -> tuple[list[Mist
     """
     if not run.config.get("robots") or run.stopped:
         return [], None
-    engine, config, events, found = engine or Trials(), dict(run.config), first_events(run, log, SCANS), list[Mistake]()
-    number = CHANGES * len(fit_of_readings(run).tried())
-    if not engine.pays("sensors of the state", number * work_of(events)):
-        return [], None
-    now = filtered_with(engine, config, log, events)
+    engine, number = engine or Trials(), CHANGES * len(fit_of_readings(run).tried())
+    events, config, found = first_events(run, log, SCANS), dict(run.config), list[Mistake]()
+    events = engine.payable(READINGS, run, events, number, number)
+    now = filtered_with(engine, config, log, events) if events else None
     while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
+        if found and not engine.pays(f"further causes in {READINGS}", number * work_of(events)):
+            break
         of = [_Sensor(engine, now, config, log, events, where) for where in now.tried()]
         tried = (m for sensor in of for m in sensor.trials())
         trials = track(tried, "sensors of the state, tried", show=engine.progress)

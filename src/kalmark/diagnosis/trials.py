@@ -38,6 +38,7 @@ from kalmark.slam.held_readings import AGAIN
 
 SCANS, OBSERVATIONS, EVENTS = 400, 3000, 10_000  # of the log are filtered again, whatever comes first
 DETECTED = 7  # observations in a raw scan, or so
+FEW_SCANS = 80  # of a log show no mistake
 FEW_SKIPPED = 0.02  # of the events may be refused in a log that fits
 MISFIT = 2.5  # mean of d2 per degree of freedom, above which a run is worth it
 FITS = 2.0  # below which a log fits
@@ -45,14 +46,15 @@ LOST = 9.0  # what an observation without an id counts that is of no landmark in
 AT_ONCE = 20_000  # observations of a log that are filtered again, or solved for
 SHARES = tuple(1.5**-k for k in range(7, -1, -1))  # of the events, after which changes are compared
 CONTROL, SCAN, OBSERVATION, IMAGE = 3, 24, 1, 1000  # the work of filtering each, in observations with ids: 1/30 ms
-WITHOUT_ID = 4  # times as much work is a scan without ids
+HARDER = 4  # times as much work is a scan without ids, or of one number each, of which several start a landmark
+PART = 500  # the work of building a filter, or of asking for its run so far
 SOLVED = 10  # the work of a batch solution and the search in it, for each observation
 BRIEF, SHARE = 300_000, 0.3  # the work of a verdict at the end of a run, 10 s: so much, or this share of the run's own
 RACED, RACE = (
     0.5,
     4,
 )  # of the budget that is left, what a race may take; how often it filters the events but first parts
-THOROUGH = 50  # times as much is that of a verdict that was asked for
+THOROUGH, UNLIMITED = 50, 1e18  # times as much is that of a verdict that was asked for; that of a search alone
 MOST = 25.0  # that one observation counts, and what counts one that was left out
 ALIKE = 0.95  # of the gain of the likeliest change: the log does not distinguish them
 SURELY = 50.0  # the gain of what is 10 sigma off
@@ -130,7 +132,7 @@ class Trials:
     be in several places has one for each.  `left_out` has the searches that were not paid, in words.
     """
 
-    def __init__(self, work: float = math.inf, progress: bool = False) -> None:
+    def __init__(self, work: float = UNLIMITED, progress: bool = False) -> None:
         self.work, self.progress, self.left_out = work, progress, list[str]()
 
     @classmethod
@@ -159,9 +161,19 @@ class Trials:
         trial.run()
         return trial.fit
 
-    def share_of_race(self, number: int, events: Iterable[Event]) -> float:
-        """Return the share of some events in which the budget pays a race of so many changes."""
-        return min(1.0, RACED * self.work / ((RACE + SHARES[0] * number) * max(work_of(events), 1)))
+    def payable(
+        self, what: str, run: Run, events: list[Event], filters: float, parts: int, *, share: float = 1.0,
+    ) -> list[Event]:  # fmt: skip
+        """Return the first of some events, those that a share of the budget pays to filter so often in so many parts.
+
+        None if these have few scans.  What is left out is named.
+        """
+        paid = share * self.work / max(filters * work_of(events) + PART * parts, 1.0)
+        if paid >= 1.0:
+            return events
+        scans = round(paid * sum(isinstance(event, Scan | Raw) for event in events))
+        self.left_out.append(f"{what}{f' after {scans} scans' if scans >= FEW_SCANS else ''}")
+        return first_events(run, events, scans) if scans >= FEW_SCANS else []
 
     def race(self, log: Log, events: list[Event], changes: Sequence[Mistake]) -> list[Mistake]:
         """Return the changes with which events fit, and are surely likelier than with the first, with their gains.
@@ -174,7 +186,7 @@ class Trials:
         now, whole, before = UNUSED if none.run() is None else none.fit, work_of(events), 0.0
         left = left if _misfit(now) > SURELY else []
         for share in SHARES:
-            most = max(1, int((self.work - end) / (whole * (share - before))))
+            most = max(1, int((self.work - end) / (whole * (share - before) + PART)))
             likeliest = sorted(left, key=lambda one: -likelihood_gain(now, one.fit))[:most]
             left = [one for one in left if one in likeliest]
             for one in track(left, f"mistakes in {share:.0%} of the first events", show=self.progress):
@@ -193,11 +205,11 @@ def work_of(events: Iterable[Event]) -> int:
 
 def _work(event: Event) -> int:
     if isinstance(event, Scan):
-        known = event.ids is not None and None not in event.ids
-        return (SCAN + OBSERVATION * len(event.y)) * (1 if known else WITHOUT_ID)
-    if isinstance(event, Raw):
-        return (SCAN + OBSERVATION * DETECTED) * WITHOUT_ID
-    return IMAGE if isinstance(event, Frame) else CONTROL
+        easy = event.ids is not None and None not in event.ids and event.y.shape[1] > 1
+        return (SCAN + OBSERVATION * len(event.y)) * (1 if easy else HARDER)
+    if isinstance(event, Frame):
+        return IMAGE
+    return (SCAN + OBSERVATION * DETECTED) * HARDER if isinstance(event, Raw) else CONTROL
 
 
 class Trial:
@@ -215,6 +227,7 @@ class Trial:
     def run(self, share: float = 1.0) -> Run | None:
         """Return the run of a share of the events, None if they are refused: then nothing fits."""
         begin, self.taken, self.fit = self.taken, round(share * len(self.events)), REFUSED
+        self.trials.spend(PART)
         with suppress(KalmarkError, np.linalg.LinAlgError):
             if self.recorder is not None:
                 part = self.events[begin : self.taken]

@@ -18,7 +18,7 @@ from kalmark.batch.batch_state import LANDMARKS, POSES
 from kalmark.diagnosis import doubled_landmarks, repeated_events
 from kalmark.diagnosis.batch_search import MORE, WORST, Searched, associated, misfits, search_causes
 from kalmark.diagnosis.blind import blind
-from kalmark.diagnosis.cause_search import Search, joined
+from kalmark.diagnosis.cause_search import SHARE, Search, joined
 from kalmark.diagnosis.cause_texts import finding_text, odd_control_text
 from kalmark.diagnosis.causes import JUMPS, LEAST_GAIN, TIMES, Finding
 from kalmark.diagnosis.gross_mistakes import gross, misfits_from, started_at
@@ -240,7 +240,8 @@ def _with_cure(
         taken[key] = joined([*have, replace(one, gain=gain)])
         at = without, changed
         rest = _judged(*at, _structural(*at, []), most, trials)
-        tried = _suspects(rest.search, 1)
+        least_gain = SHARE * sum(one.gain for one in taken.values())
+        tried = [f for f in _suspects(rest.search, 1) if f.gain > least_gain]
         if fit_of_run(without).mean > MISFITS_ALL:
             tried = chain(tried, _of_less_certain_controls(*at, most, trials))
     if not taken or sum(one.gain for one in taken.values()) < least:
