@@ -11,6 +11,7 @@ import kalmark as km
 from kalmark.config.building import build_slam, config_dict
 from kalmark.diagnosis.mistakes import change_measurements
 from kalmark.diagnosis.state_readings import NAMES, reasons
+from kalmark.diagnosis.trials import Trials
 from kalmark.diagnosis.verdict import MISFIT, diagnose
 from kalmark.simulate import load_world
 from kalmark.simulate.robots import Simulation, simulation
@@ -53,7 +54,7 @@ def test_what_is_wrong_with_a_receiver_is_named_with_its_figure(
     told = dict(part.split("=") for part in first.cure.replace("--set ", "").split())
     assert {key: float(value) for key, value in told.items()} == pytest.approx(cures, abs=0.15)
     assert first.score > 50 and np.isfinite(first.score)
-    assert next(cause.name for cause in reasons(run, simulated.log)[0]) == name
+    assert next(cause.name for cause in reasons(run, simulated.log, Trials())[0]) == name
 
 
 def test_a_right_receiver_is_not_accused() -> None:

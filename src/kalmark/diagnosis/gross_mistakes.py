@@ -50,16 +50,13 @@ WINDOW = 30  # observations, over which is asked whether the log fits from there
 STEPS = (-4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)  # by which scans may be late
 
 
-def gross(
-    run: Run, log: Log, alarmed: bool = False, trials: Trials | None = None
-) -> tuple[Mistake, Filtered | None] | None:
+def gross(run: Run, log: Log, trials: Trials, alarmed: bool = False) -> tuple[Mistake, Filtered | None] | None:
     """Return the mistake that explains most why a run does not fit, None if it does fit or if none explains it.
 
     It is looked for where something else is `alarmed`, too.  With it comes the log filtered without it, if that was.
     """
     if not run.config.get("robots"):
         return None
-    trials = trials or Trials()
     found = find_wrong_starts(run, log, trials)
     if found is not None:
         return found, None
@@ -68,23 +65,21 @@ def gross(
     explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
     first = None if explained else misfits_from(now)
     fits = now.mean < MISFIT and not run.stopped and first is None
-    alone = None if fits and not alarmed else likeliest(run, log, first, trials)
+    alone = None if fits and not alarmed else likeliest(run, log, trials, first)
     if alone is not None and of_ids is not None and first is None:  # found in the first events, compared in all
-        if not trials.pays(f"{alone.name}, compared with {of_ids[0].name}", work_of(log.events)):
-            return of_ids
-        alone = alone._replace(gain=likelihood_gain(now, trials.fit_with(log, log.events, alone)))
+        paid = trials.pays(f"{alone.name}, compared with {of_ids[0].name}", work_of(log.events))
+        alone = alone._replace(gain=likelihood_gain(now, trials.fit_with(log, log.events, alone)) if paid else 0.0)
     if alone is None or (of_ids is not None and alone.gain < of_ids[0].gain):
         return of_ids
     return alone, None
 
 
-def likeliest(run: Run, log: Log, first: int | None = None, trials: Trials | None = None) -> Mistake | None:
+def likeliest(run: Run, log: Log, trials: Trials, first: int | None = None) -> Mistake | None:
     """Return the mistake without which a log is likeliest, None if it fits as it is or without none.
 
     The log is filtered from the observation `first` on, if it fits before it: then a sensor was turned, or a source
     exchanged.  None, too, if the log is likelier where what is far off is left out: no mistake is then why it is.
     """
-    trials = trials or Trials()
     config, rest = (run.config, log) if first is None else log_from(run, log, first)
     events = first_events(run, rest.events)
     none, off = Mistake("", "", "", config), Mistake(OUTLIERS, "", "", gated(config))
@@ -102,9 +97,9 @@ def likeliest(run: Run, log: Log, first: int | None = None, trials: Trials | Non
         return found
     every = next(one for one in changes_of(run, run.config, events) if found.evidence.startswith(one.evidence))
     before = [e for e in log.events if e.t_ns < events[0].t_ns]
-    both = none._replace(config=run.config), every
     paid = trials.pays(f"{MISTAKES} before t={found.since_s:.1f} s", 2.0 * work_of(before))
-    if paid and likelihood_gain(*(trials.fit_with(log, before, one) for one in both)) > -SURELY:
+    both = (trials.fit_with(log, before, one) for one in (none._replace(config=run.config), every))
+    if paid and likelihood_gain(next(both), next(both)) > -SURELY:
         return every._replace(evidence=found.evidence, gain=found.gain, since_s=log.events[0].t_s)
     return found._replace(evidence=f"from t={found.since_s:.1f} s on {found.evidence}", cure="", of=())
 

@@ -97,7 +97,7 @@ class FilteredRun(NamedTuple):
 
 def filtered_with(trials: Trials, config: Mapping[str, Any], log: Log, events: list[Event]) -> FilteredRun | None:
     """Return the fit of events under a configuration, None if they are refused."""
-    run = trials.filter(config, log, events)
+    run = trials.filter(config, log, events, shown=False)
     return None if run is None else fit_of_readings(run)
 
 
@@ -275,20 +275,23 @@ def _same(told: tuple[str, str], _: FilteredRun) -> tuple[str, str]:
     return told
 
 
-def reasons(run: Run, log: Log, engine: Trials | None = None) -> tuple[list[Mistake], FilteredRun | None]:
+def _is_paid(engine: Trials, now: FilteredRun, number: int, events: list[Event]) -> bool:
+    """Return whether readings are still off, and a search for their next cause is in the budget."""
+    return bool(now.off()) and engine.pays(f"further causes in {READINGS}", number * work_of(events))
+
+
+def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], FilteredRun | None]:
     """Return the faults of sensors of the state in a run that does not fit, and the fit of the log without them.
 
     Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.
     """
     if not run.config.get("robots") or run.stopped:
         return [], None
-    engine, number = engine or Trials(), CHANGES * len(fit_of_readings(run).tried())
-    events, config, found = first_events(run, log, SCANS), dict(run.config), list[Mistake]()
+    config, found, number = dict(run.config), list[Mistake](), CHANGES * len(fit_of_readings(run).tried())
+    events = first_events(run, log, SCANS)
     events = engine.payable(READINGS, run, events, number, number)
     now = filtered_with(engine, config, log, events) if events else None
-    while now is not None and len(found) < MOST_CAUSES and (not found or now.off()):
-        if found and not engine.pays(f"further causes in {READINGS}", number * work_of(events)):
-            break
+    while now is not None and len(found) < MOST_CAUSES and (not found or _is_paid(engine, now, number, events)):
         of = [_Sensor(engine, now, config, log, events, where) for where in now.tried()]
         tried = (m for sensor in of for m in sensor.trials())
         trials = track(tried, "sensors of the state, tried", show=engine.progress)

@@ -50,10 +50,8 @@ HARDER = 4  # times as much work is a scan without ids, or of one number each, o
 PART = 500  # the work of building a filter, or of asking for its run so far
 SOLVED = 10  # the work of a batch solution and the search in it, for each observation
 BRIEF, SHARE = 300_000, 0.3  # the work of a verdict at the end of a run, 10 s: so much, or this share of the run's own
-RACED, RACE = (
-    0.5,
-    4,
-)  # of the budget that is left, what a race may take; how often it filters the events but first parts
+RACED = 0.5  # of the budget that is left, the most that a race takes
+RACE = 4  # times a race filters all of its events, besides the first part of each change
 THOROUGH, UNLIMITED = 50, 1e18  # times as much is that of a verdict that was asked for; that of a search alone
 MOST = 25.0  # that one observation counts, and what counts one that was left out
 ALIKE = 0.95  # of the gain of the likeliest change: the log does not distinguish them
@@ -129,11 +127,12 @@ class Trials:
     """The filter of the changed logs of a verdict, and the budget of their work.
 
     `work` is a count, the same on every machine: of events, observations (`work_of`) and filters, as a robot that may
-    be in several places has one for each.  `left_out` has the searches that were not paid, in words.
+    be in several places has one for each.  `left_out` has the searches that were not paid, in words,
+    and since when those were not that were paid in part.
     """
 
     def __init__(self, work: float = UNLIMITED, progress: bool = False) -> None:
-        self.work, self.progress, self.left_out = work, progress, list[str]()
+        self.work, self.progress, self.left_out = work, progress, dict[str, str]()
 
     @classmethod
     def of(cls, log: Log, brief: bool, progress: bool) -> Trials:
@@ -143,22 +142,22 @@ class Trials:
 
     def pays(self, what: str, work: float) -> bool:
         """Return whether a search of so much work is in the budget; name it if it is not."""
-        if work > self.work and what not in self.left_out:
-            self.left_out.append(what)
+        if work > self.work:
+            self.left_out[what] = ""
         return work <= self.work
 
     def spend(self, work: float) -> None:
         """Take work that was done off the budget."""
         self.work -= work
 
-    def filter(self, config: Mapping[str, Any], log: Log, events: Iterable[Event]) -> Run | None:
+    def filter(self, config: Mapping[str, Any], log: Log, events: Iterable[Event], shown: bool = True) -> Run | None:
         """Return the run of events under a configuration, None if they are refused."""
-        return Trial(self, log, events, Mistake("", "", "", config)).run()
+        return Trial(self, log, events, Mistake("", "", "", config)).run(shown=shown and self.progress)
 
     def fit_with(self, log: Log, events: Iterable[Event], change: Mistake) -> Fit:
         """Return the fit of some events of a log with a change."""
         trial = Trial(self, log, events, change)
-        trial.run()
+        trial.run(shown=self.progress)
         return trial.fit
 
     def payable(
@@ -166,13 +165,13 @@ class Trials:
     ) -> list[Event]:  # fmt: skip
         """Return the first of some events, those that a share of the budget pays to filter so often in so many parts.
 
-        None if these have few scans.  What is left out is named.
+        None if these have few scans.  The rest is named.
         """
         paid = share * self.work / max(filters * work_of(events) + PART * parts, 1.0)
         if paid >= 1.0:
             return events
         scans = round(paid * sum(isinstance(event, Scan | Raw) for event in events))
-        self.left_out.append(f"{what}{f' after {scans} scans' if scans >= FEW_SCANS else ''}")
+        self.left_out[what] = f" after {scans} scans" if scans >= FEW_SCANS else ""
         return first_events(run, events, scans) if scans >= FEW_SCANS else []
 
     def race(self, log: Log, events: list[Event], changes: Sequence[Mistake]) -> list[Mistake]:
@@ -224,15 +223,18 @@ class Trial:
             slam = build_slam(config_of(Tree(deepcopy(dict(change.config))), None), part)
             self.recorder = Recorder(slam, part, False, None)
 
-    def run(self, share: float = 1.0) -> Run | None:
-        """Return the run of a share of the events, None if they are refused: then nothing fits."""
+    def run(self, share: float = 1.0, shown: bool = False) -> Run | None:
+        """Return the run of a share of the events, None if they are refused: then nothing fits.
+
+        With `shown`, standard error shows a bar.
+        """
         begin, self.taken, self.fit = self.taken, round(share * len(self.events)), REFUSED
         self.trials.spend(PART)
         with suppress(KalmarkError, np.linalg.LinAlgError):
             if self.recorder is not None:
                 part = self.events[begin : self.taken]
-                shown = track(part, "the log, filtered again", len(part), show=self.trials.progress)
-                self.recorder.take(shown, "skip", [self._spend])
+                bar = track(part, "the log, filtered again", len(part), show=shown)
+                self.recorder.take(bar, "skip", [self._spend])
                 run = self.recorder.run(0.0)
                 if not run.stopped and len(run.skipped) <= FEW_SKIPPED * len(self.events):
                     self.fit = fit_of_run(run, self.change.shrunk)

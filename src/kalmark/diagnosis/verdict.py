@@ -177,10 +177,11 @@ def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bo
 def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:
     """Return a verdict that names the searches which the budget did not pay: no map is ok that then does not fit."""
     now, causes = fit_of_run(run), verdict.causes
-    if verdict.map == OK and (now.mean > MISFITS_ALL or misfits_from(now) is not None):
+    misfit = now.mean > MISFITS_ALL or misfits_from(now) is not None
+    if verdict.map == OK and misfit and not all(trials.left_out.values()):
         line = next(iter((*window_warnings(run), *_all_misfit(run))), MISFITTING)
         verdict = replace(verdict, map=DOUBTFUL, causes=(Cause(MISFIT, begin_s(run), 0.0, line), *causes))
-    return replace(verdict, left_out=tuple(trials.left_out))
+    return replace(verdict, left_out=tuple(what + since for what, since in trials.left_out.items()))
 
 
 def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
@@ -188,7 +189,7 @@ def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
     off, explained = readings_off(run, log, trials)
     first = _structural(run, log, off)
     alarmed = any(not cause.harmless for cause in first)
-    found = None if explained else gross(run, log, alarmed, trials)
+    found = None if explained else gross(run, log, trials, alarmed)
     if found is None:
         return _with_cure(run, log, _judged(run, log, first, most, trials), alarmed, most, trials)
     mistake, without = found
@@ -228,7 +229,7 @@ def _with_cure(
     if not doubted:
         return verdict
     if len(run.history.d2) > AT_ONCE:
-        trials.left_out.append(f"cures in a log of more than {AT_ONCE} observations")
+        trials.left_out[f"cures in a log of more than {AT_ONCE} observations"] = ""
         return verdict
     tried: Iterable[Finding] = chain(also, suspects, _of_less_certain_controls(run, log, most, trials))
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
