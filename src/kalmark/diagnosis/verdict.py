@@ -225,11 +225,10 @@ def _with_cure(
     suspects = _suspects(verdict.search, TRIED)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
-    doubted |= any(f.name == LATE or f.begins for f in suspects)  # whose sizes are so far from linear
-    if not doubted:
-        return verdict
     if len(run.history.d2) > AT_ONCE:
-        trials.left_out[f"cures in a log of more than {AT_ONCE} observations"] = ""
+        trials.left_out |= {f"cures in a log of more than {AT_ONCE} observations": ""} if doubted else {}
+        return verdict
+    if not doubted and not any(f.name == LATE or f.begins for f in suspects):  # whose sizes are so far from linear
         return verdict
     tried: Iterable[Finding] = chain(also, suspects, _of_less_certain_controls(run, log, most, trials))
     taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
