@@ -58,8 +58,8 @@ def _turns(columns: tuple[str, ...]) -> list[int]:
 class Course:
     """One robot's motion since its last node, in that node's frame, and the errors it gathered.
 
-    `Q` (k + 1, dof, dof) are the covariances by the k components of the control and by everything else, `T` (dof, K)
-    the derivative by the systematic errors.
+    `Q` (k + 2, dof, dof) are the covariances by the k components of the control, by gaps in the controls and by
+    everything else, `T` (dof, K) the derivative by the systematic errors.
     """
 
     def __init__(self, robot: Robot, node: int, bias: Array | None = None) -> None:
@@ -76,7 +76,7 @@ class Course:
         """Start from a node."""
         self.node, self.moves, self.known = node, 0, True
         space = self.motion.space
-        self.moved, self.Q = ORIGIN[space.size], np.zeros((len(self.columns) + 1, space.dof, space.dof))
+        self.moved, self.Q = ORIGIN[space.size], np.zeros((len(self.columns) + 2, space.dof, space.dof))
         self.T = np.zeros((space.dof, 2 * len(self.columns) + len(self.turns)))
         self.shared: dict[int, Array] = {}
 
@@ -97,16 +97,16 @@ class Course:
             self.N, self.root = part.N, root(part.N)
         if part.first and part.last:
             G = (R_u @ self.root).T
-            self.Q[:-1] += G[:, :, None] * G[:, None, :]
+            self.Q[:-2] += G[:, :, None] * G[:, None, :]
         else:
             if part.first:
                 self.held = len(roots)
                 roots.append(self.root)
             self.shared[self.held] = self.shared.get(self.held, 0.0) + R_u @ roots[self.held]
-        for D in (self.motion.diffusion(part.u, part.dt_s), part.unknown):
+        for k, D in enumerate((part.unknown, self.motion.diffusion(part.u, part.dt_s)), -2):
             if D is not None:
                 axes = sensor_pose(self.moved, ORIGIN[len(self.moved)])[2]  # of the robot
-                self.Q[-1] += axes @ D @ axes.T
+                self.Q[k] += axes @ D @ axes.T
 
     def _control(self, part: MotionPart) -> Array:
         """Return the control of a part, as it is with the constants that are known."""
@@ -117,12 +117,14 @@ class Course:
     def _stay(self, part: MotionPart, F: Array, R_u: Array) -> None:
         """Carry the systematic errors on, in the order of `systematic_errors`."""
         k, T = len(part.u), F @ self.T
+        self.T = T
+        if part.unknown is not None:  # in a gap no control was measured
+            return
         T[:, :k] += R_u if self.motion.held else R_u * part.dt_s
         T[:, k : 2 * k] += R_u * part.u
         if self.turns:
             way = part.u[self.lengths]
             T[:, 2 * k :] += R_u[:, self.turns] * math.sqrt(way @ way)
-        self.T = T
 
 
 class Node(NamedTuple):
@@ -197,7 +199,7 @@ class Chain:
         for name, course in self.courses.items():
             of = [i for i, node in enumerate(self.nodes) if node.robot == name]
             Q = root(np.array([self.nodes[i].Q for i in of]))
-            kinds = [f"{name}.{column}" for column in (*course.columns, OTHER)]
+            kinds = [*(f"{name}.{column}" for column in course.columns), UNKNOWN, f"{name}.{OTHER}"]
             for c, kind in enumerate(kinds):
                 for i, G in zip(of, Q[:, c], strict=True):
                     columns.add(q * i, G, self._kind(i, kind))

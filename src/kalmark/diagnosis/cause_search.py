@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
 from kalmark.diagnosis.error_columns import Where, columns_of, errors_of_all_sensors, rates_of
@@ -21,52 +22,43 @@ ROUNDS, MORE = 6, 14  # in which all that is certain is taken out, and further o
 SHARE = (
     0.01  # of all that was explained: a log with many causes comes back to some of them, and more rounds are used up
 )
-TAKEN_UP, ALIKE = 0.5, 0.85
+ALIKE = 0.85  # of what the strongest explains: a systematic error that may be told in its place
 MOST_CONDITION = 1e6  # of the information on errors of one column, as correlations
-ORDER = ("steering_offset", "mount_position", "odometry_scale", "odometry_turn", "odometry_offset")
 SCALINGS, SCALED = 5, 0.03
-NEAR = 9.0  # d2 of a landmark that an observation may well be of
-LOOKED_AT, DRAWS = 200, 40  # outliers whose landmarks are looked for, and draws of their errors
-MANY = 0.3  # of the outliers, beyond chance, are of another landmark: it pulls its scan, and what is right is off, too
 
 
-def strongest_findings(sure: list[Finding]) -> list[Finding]:
-    """Return the finding of the largest gain, and those that gain as much after it.
+def strongest(findings: Iterable[Finding]) -> list[Finding]:
+    """Return the findings of one kind that gain most together, the largest first; none of none."""
+    kinds: dict[tuple[str, ...], list[Finding]] = {}
+    for finding in sorted(findings, key=lambda f: -f.gain):
+        kinds.setdefault(finding.kind, []).append(finding)
+    return max(kinds.values(), key=total_gain, default=[])
 
-    Surveys that are off go before outliers and noise that would take them up, which are one for all of them, landmarks
-    that move before outliers, and noise of several columns before outliers that explain clearly less: these would be
-    one for all columns.
-    A single step of the motion or a systematic error goes before a noise that would take it up.  Of those that explain
-    as much, one in the sensors goes before one in the controls.
-    """
-    first = max(sure, key=lambda f: f.gain)
-    surveys = [f for f in sure if f.name == "landmark_prior"]
-    spread = first.name == "outliers" or first.unit == causes.TIMES
-    if surveys and spread and sum(f.gain for f in surveys) > TAKEN_UP * first.gain:
-        return [max(surveys, key=lambda f: f.gain)]
-    moving = [f for f in sure if f.name == "moving_landmark"]
-    if first.name == "outliers" and sum(f.gain for f in moving) > TAKEN_UP * first.gain:
-        return [max(moving, key=lambda f: f.gain)]
-    noisy = [f for f in sure if f.unit == causes.TIMES and f.noise is not None]
-    if first.name == "outliers" and ALIKE * sum(f.gain for f in noisy) >= first.gain:
-        first = max(noisy, key=lambda f: f.gain)
-    jump = [f for f in sure if f.at is not None and f.gain > TAKEN_UP * first.gain]
-    if jump and first.unit == causes.TIMES:
-        return jump
-    steady = [f for f in sure if f.Z is not None and f.at is None and f.gain > TAKEN_UP * first.gain]
-    if not steady or first.at is not None or (first.unit != causes.TIMES and first.Z is None):
-        return [first]
-    most = max(f.gain for f in steady)
-    alike = sorted((f for f in steady if f.gain > ALIKE * most), key=lambda f: -f.gain)
-    by_name = {f.name: f for f in reversed(alike)}
-    return sorted(by_name.values(), key=lambda f: (ORDER.index(f.name) if f.name in ORDER else 0, -f.gain))
+
+def total_gain(findings: Iterable[Finding]) -> float:
+    """Return what findings gain together, of things that are independent of each other."""
+    return sum(f.gain for f in findings)
 
 
 def joined(same: list[Finding]) -> Finding:
     """Return the findings of one cause in several rounds as one."""
     first, last = same[0], same[-1]
     value = math.prod(f.value for f in same) if last.unit == causes.TIMES else sum(f.value for f in same)
-    return replace(first, value=value, sigma=last.sigma, gain=sum(f.gain for f in same))
+    noise, errors = (product(of) for of in ([f.noise for f in same], [f.errors for f in same]))
+    return replace(first, value=value, sigma=last.sigma, gain=total_gain(same), noise=noise, errors=errors)
+
+
+def product(factors: Iterable[Array | None]) -> Array | None:
+    """Return the product of the factors of a noise, None where there are none."""
+    known = [of for of in factors if of is not None]
+    return np.asarray(np.prod(known, axis=0)) if known else None
+
+
+def without(linear: Linear, finding: Finding) -> Linear:
+    """Return a problem without a cause in its data."""
+    if finding.Z is not None and finding.W is not None:
+        linear = linear.without(finding.Z * finding.value, finding.W * finding.value)
+    return linear.scaled(finding.noise, finding.errors)
 
 
 class Search:
@@ -80,6 +72,9 @@ class Search:
         at = np.searchsorted(linear.problem.nodes[order], poses)  # a pose at a fix has the time of the next scan
         self.t_s = ((t_ns - t_ns[:1].sum()) * 1e-9)[order[np.minimum(at, len(order) - 1)]]
         self.found: list[Finding] = []
+        self.instead: list[
+            tuple[Array, Array]
+        ] = []  # (z, w) of what the log does not distinguish from what was taken out
         self.suspects: list[Finding] = []  # systematic errors that explain most at first, sure or not
         self.simulated = linear.simulated(causes.SETS)
 
@@ -103,10 +98,8 @@ class Search:
             lasting = lasting or (not harmful and bool(self.correlated()))
             if not sure or (lasting and not any(f.overstated for f in sure)):
                 break
-            some = harmful or [f for f in sure if f.overstated]
-            first, *alike = strongest_findings(some)
-            first = self._of_its_name(first, some)
-            self.take(replace(first, alike=tuple(alike)))
+            self.take(self.likeliest(harmful or [f for f in sure if f.overstated]))
+        self._leave_out_explained()
         for finding in self.correlated():
             self.take(finding)
         if lasting:
@@ -115,22 +108,67 @@ class Search:
             )
         return sorted(self.found, key=lambda f: -f.gain)
 
-    def _of_its_name(self, first: Finding, sure: list[Finding]) -> Finding:
-        """Return that of the systematic errors of one name, and of about one gain, which leaves least for others.
+    def likeliest(self, sure: list[Finding]) -> Finding:
+        """Return the cause that explains most of some, with those that the log does not distinguish from it.
 
-        Where one sensor of two is long, the other is short beside it, and so are the ways of the robots.
+        Noise and outliers take up any misfit, so they count by what the strongest of the others leaves to them.
         """
-        same = [f for f in sure if f.name == first.name and f.at is None and f.gain > ALIKE * first.gain]
-        if first.Z is None or first.at is not None or len(same) < 2:
-            return first
+        any_misfit, special = ([f for f in sure if f.takes_up == which] for which in (True, False))
+        most, first = strongest(any_misfit), strongest(special)
+        if most and first and total_gain(most) > total_gain(first):
+            left = self.linear
+            for finding in first:
+                left = without(left, finding)
+            rest = causes.outliers(left, self.t_s) if most[0].unit != causes.TIMES else self._noise(left)
+            same = {(f.name, f.of) for f in most}
+            if total_gain(f for f in rest if (f.name, f.of) in same and not f.overstated) < total_gain(first):
+                most = []
+        one, *_ = most if most or not first else first
+        return self._with_alike(one, sure) if one.is_steady else one
 
-        def alone(f: Finding) -> float:
-            assert f.Z is not None and f.W is not None
-            linear = self.linear.without(f.Z * f.value, f.W * f.value)
-            others = causes.systematic(linear, columns_of(linear, self.sensors, self.rates))
-            return f.gain - max((other.gain for other in others), default=0.0)
+    def _noise(self, linear: Linear) -> list[Finding]:
+        return causes.noise(linear, linear.simulated(causes.SETS), self.sensors)
 
-        return max(same, key=alone)
+    def _with_alike(self, first: Finding, sure: list[Finding]) -> Finding:
+        """Return that of the systematic errors which explain about as much that leaves least to others.
+
+        Those that explain as much with what they leave are not distinguished from it.  Where one sensor of two is long,
+        the other is short beside it, and so are the ways of the robots.
+        """
+        rivals = [f for f in sure if f.is_steady and f.gain > ALIKE * first.gain]
+        net = {id(f): f.gain - self._left(f) for f in rivals} if len(rivals) > 1 else {}
+        alike = {
+            (f.name, *f.of[:2]): f for f in reversed(rivals) if net and net[id(f)] > max(net.values()) - LEAST_GAIN
+        }
+        one, *others = [*alike.values()][::-1] or [first]
+        return replace(one, alike=tuple(others))
+
+    def _left(self, finding: Finding) -> float:
+        """Return what another systematic error explains when one is taken out."""
+        linear = without(self.linear, finding)
+        return max(
+            (f.gain for f in causes.systematic(linear, columns_of(linear, self.sensors, self.rates))), default=0.0
+        )
+
+    def _leave_out_explained(self) -> None:
+        """Leave out noise and outliers that the causes found after them explain, and count what is left of the others.
+
+        Each is put back into the data, one after the other.
+        """
+        for finding in [f for f in self.found if f.takes_up and not f.overstated]:
+            before = self.linear.scaled(*(None if of is None else 1.0 / of for of in (finding.noise, finding.errors)))
+            rest = causes.outliers(before, self.t_s) if finding.unit != causes.TIMES else self._noise(before)
+            again = [
+                f
+                for f in self._sure(rest, LEAST_GAIN)
+                if (f.name, f.of, f.overstated) == (finding.name, finding.of, False)
+            ]
+            self.found.remove(finding)
+            if again:
+                self.found.append(replace(finding, gain=again[0].gain))
+            else:
+                self.linear = before
+                self.simulated = before.simulated(causes.SETS)
 
     def correlated(self) -> list[Finding]:
         """Return the errors that are correlated from one observation to the next."""
@@ -158,16 +196,16 @@ class Search:
 
     def take(self, finding: Finding) -> None:
         """Take a cause out of the data."""
-        if finding.Z is not None and finding.W is not None:
-            self.linear = self.linear.without(finding.Z * finding.value, finding.W * finding.value)
-            if finding.errors is not None:
-                self._scale(finding)
-            elif finding.is_steady:
-                finding = self._beside(finding)
-        elif finding.unit == causes.TIMES:
+        if finding.unit == causes.TIMES:
             finding = self._scaled(finding)
         else:
-            self._scale(finding)
+            before, self.linear = self.linear, without(self.linear, finding)
+            for other in (without(before, one) for one in finding.alike):
+                self.instead.append((other.z - self.linear.z, other.w - self.linear.w))
+            if finding.noise is not None or finding.errors is not None:
+                self.simulated = self.linear.simulated(causes.SETS)
+            if finding.is_steady:
+                finding = self._beside(finding)
         same = [
             f
             for f in self.found
@@ -209,7 +247,9 @@ class Search:
             step = next((f for f in again if (f.name, f.of) == (finding.name, finding.of)), step)
             if abs(step.value - 1.0) < SCALED:
                 break
-        return replace(finding, value=value, sigma=finding.sigma * value / finding.value)
+        by = (None if of is None else np.where(of == 1.0, 1.0, value) for of in (finding.noise, finding.errors))
+        noise, errors = by
+        return replace(finding, value=value, sigma=finding.sigma * value / finding.value, noise=noise, errors=errors)
 
     def _scale(self, finding: Finding) -> None:
         self.linear = self.linear.scaled(finding.noise, finding.errors)

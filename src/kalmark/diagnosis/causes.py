@@ -82,6 +82,18 @@ class Finding:
         return self.Z is not None and self.at is None and self.since_s is not None
 
     @property
+    def kind(self) -> tuple[str, ...]:
+        """The kind of a cause: landmarks of one kind explain together, and so do noises.  Other causes are alone."""
+        if self.Z is None:
+            return (TIMES if self.unit == TIMES else self.name,)
+        return (self.name, *self.of, str(self.since_s))
+
+    @property
+    def takes_up(self) -> bool:
+        """True if it takes up any misfit: a noise that is larger, or outliers."""
+        return self.Z is None and (self.unit == TIMES or self.rows is not None)
+
+    @property
     def overstated(self) -> bool:
         """True if it is a noise that is smaller than stated."""
         return self.unit == TIMES and self.value < 1.0

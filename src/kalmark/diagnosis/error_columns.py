@@ -75,10 +75,8 @@ def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates:
     factors, nothing = linear.problem.factors, np.zeros(len(linear.at.w))
     found: dict[tuple[str, ...], Column] = {}
     for f, factor in enumerate(factors):
-        names, p = sensors.get(factor.sensor, ()), factor.R.shape[1]
-        if len(names) != p:
-            continue
-        for name, of, unit, most, part in _of_sensor(factor, linear.state, names, rates):
+        names = sensors.get(factor.sensor)
+        for name, of, unit, most, part in () if names is None else _of_sensor(factor, linear.state, names, rates):
             parts = [np.zeros(other.R.shape[:2]) for other in factors]
             parts[f] = part
             have, Z = found.get((name, *of)), linear.whitened(parts)
@@ -89,21 +87,13 @@ def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates:
 def _of_sensor(
     factor: Factor, state: BatchState, names: tuple[str, ...], rates: Array
 ) -> Iterator[tuple[str, tuple[str, ...], str, float, Array]]:
-    """Yield the name, place, unit and limit of each error of a sensor, and what it adds to its innovations (K, p)."""
+    """Yield the name, place, unit and limit of each error of a sensor, and what it adds to its innovations (K, p).
+
+    Errors of its columns are those of a sensor with one innovation of each.
+    """
     z, E = factor.term.at(state)
-    e, one = factor.y[:, : z.shape[1]] - z, np.ones_like(z)  # of a wall, not its ends
-    longer = _longer(names, e)
-    for c, name in enumerate(names):
-        of, mine = (*factor.sensor, name), np.eye(len(names))[c]
-        if name.startswith(LENGTHS) and name.endswith("_m"):
-            yield "range_scale", of, "", MOST_SCALE, longer * mine
-            yield "range_offset", of, "m", math.inf, one * mine
-        elif name.endswith("_rad"):
-            offset = "bearing_offset" if name == "normal_rad" else f"{name.removesuffix('_rad')}_offset"
-            yield offset, of, "rad", math.inf, one * mine
-        elif longer[:, c].any() and not longer[:, :c].any():  # one scale of all columns
-            scaled = [other for k, other in enumerate(names) if longer[:, k].any()]
-            yield "range_scale", (*factor.sensor, *scaled), "", MOST_SCALE, longer
+    if len(names) == z.shape[1]:
+        yield from _of_its_columns(factor, names, z)
     moving, first = np.zeros_like(z), 0
     for block in factor.term.blocks:
         dof = block.space.dof
@@ -119,6 +109,25 @@ def _of_sensor(
         shifted = np.einsum("kij,kjc->kic", E[:, :, :d], axes)
         for k, name in enumerate(("x_m", "y_m", "z_m")[:d]):
             yield "mount_position", (*factor.sensor, name), "m", most, shifted[:, :, k]
+
+
+def _of_its_columns(
+    factor: Factor, names: tuple[str, ...], z: Array
+) -> Iterator[tuple[str, tuple[str, ...], str, float, Array]]:
+    """Yield the errors of the columns of a sensor, as `_of_sensor`, whose innovations are z (K, p)."""
+    e, one = factor.y[:, : z.shape[1]] - z, np.ones_like(z)  # of a wall, not its ends
+    longer = _longer(names, e)
+    for c, name in enumerate(names):
+        of, mine = (*factor.sensor, name), np.eye(len(names))[c]
+        if name.startswith(LENGTHS) and name.endswith("_m"):
+            yield "range_scale", of, "", MOST_SCALE, longer * mine
+            yield "range_offset", of, "m", math.inf, one * mine
+        elif name.endswith("_rad"):
+            offset = "bearing_offset" if name == "normal_rad" else f"{name.removesuffix('_rad')}_offset"
+            yield offset, of, "rad", math.inf, one * mine
+        elif longer[:, c].any() and not longer[:, :c].any():  # one scale of all columns
+            scaled = [other for k, other in enumerate(names) if longer[:, k].any()]
+            yield "range_scale", (*factor.sensor, *scaled), "", MOST_SCALE, longer
 
 
 def _axes(poses: Array) -> Array:

@@ -37,15 +37,18 @@ MOST = 0.5  # of the ids that were seen meanwhile: more of them are not moved, t
 SHARE = 0.1  # of the observations of an id that are of another place, or of a place after it was left
 SAME = 0.25  # of the distance to the next landmark, within which two places are one
 OUTLIERS, TWICE, MOVED, MISPLACED = "outliers", "wrong_ids", "moving_landmark", "misplaced_landmark"  # the causes
-MOVES, TWO, GONE = "moves", "on two things", "moved"
+PRIOR = "landmark_prior"
+MOVES, TWO, GONE, OFF_SURVEY = "moves", "on two things", "moved", "off its survey"
 TEXTS = {  # of one, and of several
     MOVES: ("landmark {} moves", "landmarks {} move"),
     TWO: ("id {} is on two things", "ids {} are on two things each"),
     GONE: ("landmark {} is elsewhere: moved", "landmarks {} are elsewhere: moved"),
+    OFF_SURVEY: ("landmark {} is not where its survey has it", "landmarks {} are not where their surveys have them"),
 }
 ANOTHER = ", and fit another one far more often than by chance"
 SECOND = " (2)"  # after an id, of what does not fit it
 CURE, OWN_ID = f"--set association.gate={GATE}", "give each thing an id of its own, and a thing that is moved a new one"
+SURVEY_CURE = "correct their places in the file of the survey, or leave them out"
 
 
 def gated(config: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -95,7 +98,7 @@ def find_wrong_ids(run: Run, log: Log, now: Fit, trials: Trials) -> tuple[Mistak
     if gain < SURELY * mean and not by_itself:  # the filter may have left it out, which chance does seldom
         return None
     if found is not None and not mixed:
-        return found[0]._replace(cure=cure, gain=max(gain, 0.0)), Filtered(found[1], log)
+        return found[0]._replace(cure=found[0].cure or cure, gain=max(gain, 0.0)), Filtered(found[1], log)
     evidence = f"{out.mean():.1%} of the observations are far off where their landmark is"
     name, cure, told = (TWICE, cure, ANOTHER) if mixed else (OUTLIERS, CURE, "")
     without = first if found is None else found[1]
@@ -173,28 +176,47 @@ def _places_of_ids(
     config: Mapping[str, Any], log: Log, first: Run, out: Flags, trials: Trials
 ) -> tuple[tuple[Mistake, Run] | None, list[str], float]:
     """Return that ids mean other places, the log filtered with names for these, which, and how much likelier it is."""
-    h = first.history
-    wrong, rows = list[str](), np.zeros(len(out), dtype=np.bool_)
-    for name in np.unique(h.id[out]).tolist():
-        mine = h.id == name
-        if (mine & out).sum() >= max(LEAST, SHARE * mine.sum()):
-            wrong.append(name)
-            rows |= mine & out
-    seen = {*h.id[np.argmax(rows) :].tolist()} - {""}
+    h, d = first.history, first.history.d
+    surveys = {str(prior.landmark): prior.mean[:d] for prior in h.priors}
+    number = {name: (int((h.id == name).sum()), int((out & (h.id == name)).sum())) for name in np.unique(h.id[out])}
+    wrong = [str(i) for i, (n, k) in number.items() if k >= SHARE * n and (k >= LEAST or i in surveys)]
+    of_wrong = np.isin(h.id, wrong)
+    seen = {*h.id[np.argmax(of_wrong & out) :].tolist()} - {""}
     if not wrong or len(wrong) > MOST * len(seen):
         return None, [], 0.0
-    again = trials.filter(config, log, _renamed(log, first, np.flatnonzero(rows), _other))
-    if again is None:
+    parts = [of_wrong & out, of_wrong & (out | np.isin(h.id, [*surveys]))]  # of a survey that is off all are elsewhere
+    runs = [
+        trials.filter(config, log, _renamed(log, first, np.flatnonzero(rows), _other))
+        for rows in parts[: 1 + (parts[0] != parts[1]).any()]
+    ]
+    tried = [(likelihood_gain(fit_of_run(first), fit_of_run(run)), run) for run in runs if run is not None]
+    gain, again = max(tried, key=lambda of: of[0], default=(0.0, first))
+    if again is first or fit_of_run(again).mean > FITS:
         return None, [], 0.0
-    h, after = again.history, fit_of_run(again)
-    if after.mean > FITS:
+    told = _meanings(again, surveys, wrong)
+    if not told:
         return None, [], 0.0
-    places = {str(i): p for i, p in zip(again.landmarks.ids, again.landmarks.positions()[0], strict=True)}
+    since_s = _since_s(again, np.concatenate([_in_order(again.history, name)[-1][1] for name in told]))
+    cause = PRIOR if {*told.values()} == {OFF_SURVEY} else MOVED if {*told.values()} <= {MOVES, GONE} else TWICE
+    evidence, cure = f"from t={since_s:.1f} s on {_together(told)}", SURVEY_CURE if cause == PRIOR else ""
+    mistake = Mistake(cause, evidence, cure, config, None, 0.0, since_s)
+    return (mistake, again), [*told], gain
+
+
+def _meanings(again: Run, surveys: Mapping[str, Array], wrong: list[str]) -> dict[str, str]:
+    """Return the meanings of ids in a run with names for both of their places; none of surveys that are right."""
+    h, (means, P), d = again.history, again.landmarks.positions(), again.history.d
+    at = {str(name): k for k, name in enumerate(again.landmarks.ids)}
+    places = {name: means[k] for name, k in at.items()}
     told = {name: _told(h, places, name) for name in wrong}
-    since_s = _since_s(again, np.concatenate([_in_order(h, name)[-1][1] for name in wrong]))
-    cause = MOVED if {*told.values()} <= {MOVES, GONE} else TWICE
-    mistake = Mistake(cause, f"from t={since_s:.1f} s on {_together(told)}", CURE, config, None, 0.0, since_s)
-    return (mistake, again), wrong, likelihood_gain(fit_of_run(first), after)
+    for name in [name for name in wrong if name in surveys and not (h.id == name).any()]:
+        k = at.get(_other(name))
+        off = np.zeros(d) if k is None else means[k] - surveys[name]
+        if k is None or off @ np.linalg.solve(P[k], off) < gate(GATE, d):
+            del told[name]
+        elif told[name] != MOVES:
+            told[name] = OFF_SURVEY
+    return told
 
 
 def _since_s(run: Run, rows: Ints) -> float:

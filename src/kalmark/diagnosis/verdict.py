@@ -284,8 +284,8 @@ def _of_less_certain_controls(run: Run, log: Log, most: int, trials: Trials) -> 
 def _suspects(search: Search | None, most: int) -> list[Finding]:
     """Return the likeliest errors of a search that are tried: those that are certain, and one that may explain more."""
     sure = _steady(search)[:most]
-    may_be = search.suspects[:1] if search else []
-    return sure + [f for f in may_be if all(f.gain > one.gain for one in sure)]
+    may_be, told = search.suspects[:1] if search else [], [(f.name, f.of) for one in sure for f in one.alike]
+    return sure + [f for f in may_be if (f.name, f.of) not in told and all(f.gain > one.gain for one in sure)]
 
 
 def _steady(search: Search | None) -> list[Finding]:
@@ -336,6 +336,7 @@ def _bent(run: Run, without: Run) -> tuple[str, float]:
         nearest = cKDTree(np.nan_to_num(places)).query(np.nan_to_num(mine))[1]
         at = np.where(np.isin(names[0], run.history.id), at, nearest)
     both = np.isfinite(mine).all(axis=1) & np.isfinite(places[at]).all(axis=1) & (at >= 0)
+    both &= np.isin(np.array(names[1])[at], without.history.landmark)  # those of surveys alone are as these are
     if both.sum() < NEEDED:
         return WRONG, 0.0
     mine, twice, places = mine[both], both.sum() - len(np.unique(at[both])), places[at[both]]
@@ -443,9 +444,20 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
     again = restarts(run.history)  # their starts were made uncertain for the batch solution
     matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
     matter = [f for f in matter if f.name != "start" or not again]
+    matter = [f for f in matter if not _is_of_gap(run, f)]
     lasting = {f.of for f in matter if f.name == "correlated_noise"}
     causes = [(f, _cause(run, f, log)) for f in merge_jumps(matter, begin_s(run))]
     return [replace(c, cure="") if f.overstated and f.of in lasting else c for f, c in causes]
+
+
+def _is_of_gap(run: Run, finding: Finding) -> bool:
+    """Return whether a finding is an error of controls while there was none: then the gap is named."""
+    if finding.W is None or not finding.W.any() or finding.since_s is None:
+        return False
+    since_s = begin_s(run) + finding.since_s
+    until_s = begin_s(run) + finding.until_s if finding.begins else since_s
+    gaps = ((gap["robot"], gap["start_s"], gap["end_s"]) for gap in run.summary.get("gaps", ()) if gap["kind"] in KINDS)
+    return any(robot == finding.of[0] and a <= since_s and until_s <= b for robot, a, b in gaps)
 
 
 def _increments_s(run: Run, robot: str) -> float:
@@ -838,6 +850,9 @@ def effect_of(run: Run, found: Searched) -> Effect:
     onto, extent = rigid(places, moved), rmse(moved - moved.mean(axis=0))
     robots = dict(_paths(run, found, onto, extent)) if len(rows) > d else {}
     off = _off(onto, places, moved, angle)
+    for z, w in found.search.instead:  # which of both is not known: the map is as good as with the worse one
+        other = replace(cured, z=cured.z + z, w=cured.w + w).moved().groups[LANDMARKS][its, :d]
+        off = max(off, _off(rigid(places, other), places, other, angle), key=rmse)
     by_steady = rmse(_off(rigid(places, steady), places, steady, angle))
     P = np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine])
     (stated, bare_stated), (honest, bare_honest) = (_sigmas(each, places, its, ~lines) for each in (first, cured))
