@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from hall import hall, mapped
 import kalmark as km
 from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import replay_events
+from kalmark.batch.motion_chain import Course
 from kalmark.batch.solver import optimum
 from kalmark.cli.app import main
 from kalmark.cli.run import run_log
@@ -29,7 +32,7 @@ from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.repeated_events import repeated_measurements
 from kalmark.diagnosis.trials import fit_of_run
-from kalmark.diagnosis.verdict import Verdict, causes_of
+from kalmark.diagnosis.verdict import Verdict, _is_of_gap, causes_of
 from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import SE3
@@ -40,6 +43,7 @@ from kalmark.results.measures import rigid, rmse
 from kalmark.results.run import Run
 from kalmark.results.verdict_text import verdict_lines
 from kalmark.simulate import load_world, simulate
+from kalmark.slam.held_control import MotionPart
 
 WORLD = ("world.count=30", "world.size_m=24", "steps=400", "robots.rover.start={x_m: 12, y_m: 12, theta_rad: 0}")
 SIGMA = "robots.rover.sensors.lidar.sigma_range_m"
@@ -806,6 +810,45 @@ def test_noise_of_several_columns_is_no_outliers() -> None:
     verdict = km.diagnose(recorded_under(config, log))
     assert {cause.name for cause in verdict.causes[:3]} == {"range_sigma", "azimuth_sigma", "elevation_sigma"}
     assert verdict.map == "ok"
+
+
+def test_a_noise_that_was_taken_for_a_systematic_error_is_left_out_when_that_is_found() -> None:
+    again = copy(verdict_on(*FAULTS["range_scale"][:2]).search)
+    assert again is not None
+    again.linear, again.found, again.simulated = again.first, [], again.first.simulated(40)
+    noise = next(f for f in again.candidates() if f.name == "range_sigma")
+    scale = next(f for f in again.candidates() if f.name == "range_scale")
+    assert noise.takes_up
+    assert again.likeliest([noise, scale]).name == "range_scale"  # whatever the noise gains with it in the data
+    again.take(noise)
+    again.take(scale)
+    again._leave_out_explained()
+    assert [f.name for f in again.found] == ["range_scale"]
+    assert again.linear.noise == pytest.approx(1.0)
+
+
+def test_an_error_of_controls_in_a_gap_of_them_is_no_cause() -> None:
+    run: Any = SimpleNamespace(
+        history=SimpleNamespace(t_ns=np.array([10**9])),
+        summary={"gaps": [{"robot": "a", "kind": "held", "start_s": 5.0, "end_s": 9.0}]},
+    )
+    slip = Finding("odometry_turn", ("a", "w_radps", "scale"), 90.0, 0.0, 1.0, Z=np.zeros(1), W=np.ones(1), since_s=4.5)
+    assert _is_of_gap(run, replace(slip, until_s=7.0))
+    assert not _is_of_gap(run, slip)  # to the end
+    assert not _is_of_gap(run, replace(slip, since_s=3.0, until_s=7.0))
+    assert not _is_of_gap(run, replace(slip, of=("b", "w_radps", "scale"), until_s=7.0))
+    assert not _is_of_gap(run, replace(slip, W=np.zeros(1), until_s=7.0))  # of a sensor
+
+
+def test_no_error_of_controls_adds_to_a_gap() -> None:
+    course = Course(km.Robot("a", km.motion.Unicycle()), 0)
+    u, unknown = np.array([1.0, 0.1]), np.diag([4.0, 4.0, 0.1])
+    course.add(MotionPart(u, np.eye(2), 1.0, True, True, unknown), [])
+    assert not course.T.any()
+    assert course.Q[-1] == pytest.approx(0.0)
+    assert np.trace(course.Q[-2]) == pytest.approx(8.1)
+    course.add(MotionPart(u, np.eye(2), 1.0, True, True), [])
+    assert course.T.any()
 
 
 def test_the_cure_of_a_control_noise_names_the_key_of_its_column() -> None:

@@ -60,6 +60,26 @@ CASES: dict[str, tuple[str, Plant, tuple[str, ...], str, str, str]] = {
         "two_robots", scans(lambda y: y, "beta", 0.3), ("steps=300",),
         "ok", "scans of beta.camera were made 0.2", "log.shift_s.beta.camera=-0.2",
     ),
+    # poses have other innovations than columns
+    "poses of tags that are late": (
+        "tags_room", scans(lambda y: y, late_s=0.15), (
+            "steps=100", "robots.rig.sensors={camera: {type: tag_pose}}",
+            "robots.rig.route={type: waypoints, points_m: [[6, 1.5, 1.2], [6, 4.5, 1.5], [2, 4.5, 1.2], [2, 1.5, 1]],"
+            " speed_mps: 0.5, turn_radius_m: 0.4}",
+        ),
+        "doubtful", "scans of rig.camera were made 0.[01]", "log.shift_s.rig.camera=-0.[01]",
+    ),
+    # on a circle a mount does the same, and always the ways
+    "ranges of one of two that are far apart": (
+        "two_robots", scans(lambda y: y * [1.05, 1.0], "alpha"), (
+            "steps=300", "world.size_m=40", "world.count=100", "sight_robots=false",
+            "robots.alpha.start={x_m: 10, y_m: 6, theta_rad: 0}", "robots.beta.start={x_m: 25, y_m: 25, theta_rad: 0}",
+            "robots.beta.route={type: waypoints, points_m: [[35, 25], [35, 35], [25, 35], [25, 25]], speed_mps: 0.8,"
+            " turn_radius_m: 1}",
+        ),
+        "doubtful", "ranges of alpha.lidar .*distinguish this from mount_position .*odometry_scale",
+        "alpha.sensors.lidar.scale=1.0",
+    ),
     "a laser that looks aside": (
         "hall_of_walls", scans(lambda y: np.add(y, [0.0, math.pi / 2])), ("steps=150",),
         "wrong", "walls and corners of robot look -90 deg away", "corners.mount.theta_rad=-1.5708",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.diagnosis.single_ids import GONE, MOVES, TWO, _renamed, _together, _told
+from kalmark.diagnosis.single_ids import GONE, MOVES, OFF_SURVEY, TWO, _meanings, _renamed, _together, _told
 from kalmark.events import Scan
 from kalmark.logs.log import Log
 from kalmark.results.history import History
@@ -40,6 +40,18 @@ def history(ids: list[str], rejected: str = "") -> History:
 )
 def test_observations_in_their_order_show_what_an_id_means(ids: list[str], rejected: str, meaning: str) -> None:
     assert _told(history(ids, rejected), PLACES, "a") == meaning
+
+
+def test_a_survey_is_off_where_all_observations_of_its_id_are_elsewhere() -> None:
+    ids = [name for name in ("a (2)", "b (2)", "c (2)") for _ in range(4)]
+    places = {"a (2)": np.array([9.0, 0.0]), "b (2)": np.array([0.1, 8.0])}  # c was never started
+    landmarks = SimpleNamespace(
+        ids=[*places], positions=lambda: (np.array([*places.values()]), np.tile(np.eye(2), (2, 1, 1)))
+    )
+    run: Any = SimpleNamespace(history=SimpleNamespace(**vars(history(ids)), d=2), landmarks=landmarks)
+    surveys = {name: PLACES[name] for name in "abc"}
+    assert _meanings(run, surveys, ["a", "b", "c"]) == {"a": OFF_SURVEY}
+    assert _meanings(run, {}, ["a"]) == {"a": GONE}
 
 
 def test_a_thing_in_the_place_of_another_is_exchanged_and_the_only_one_is_not() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -113,21 +114,19 @@ class Search:
 
         Noise and outliers take up any misfit, so they count by what the strongest of the others leaves to them.
         """
-        any_misfit, special = ([f for f in sure if f.takes_up == which] for which in (True, False))
-        most, first = strongest(any_misfit), strongest(special)
-        if most and first and total_gain(most) > total_gain(first):
-            left = self.linear
-            for finding in first:
-                left = without(left, finding)
-            rest = causes.outliers(left, self.t_s) if most[0].unit != causes.TIMES else self._noise(left)
-            same = {(f.name, f.of) for f in most}
-            if total_gain(f for f in rest if (f.name, f.of) in same and not f.overstated) < total_gain(first):
-                most = []
-        one, *_ = most if most or not first else first
+        any_misfit, special = (strongest(f for f in sure if f.takes_up == which) for which in (True, False))
+        if special and total_gain(any_misfit) > total_gain(special):
+            left = self._any_misfit(reduce(without, special, self.linear))
+            of = {(f.name, f.of) for f in any_misfit}
+            if total_gain(f for f in left if (f.name, f.of) in of) > total_gain(special):
+                special = []
+        one = (special or any_misfit or sure)[0]
         return self._with_alike(one, sure) if one.is_steady else one
 
-    def _noise(self, linear: Linear) -> list[Finding]:
-        return causes.noise(linear, linear.simulated(causes.SETS), self.sensors)
+    def _any_misfit(self, linear: Linear) -> list[Finding]:
+        """Return what takes up any misfit of a problem: outliers, and noise that is larger than stated."""
+        found = causes.noise(linear, linear.simulated(causes.SETS), self.sensors)
+        return [*causes.outliers(linear, self.t_s), *(f for f in found if not f.overstated)]
 
     def _with_alike(self, first: Finding, sure: list[Finding]) -> Finding:
         """Return that of the systematic errors which explain about as much that leaves least to others.
@@ -136,39 +135,29 @@ class Search:
         the other is short beside it, and so are the ways of the robots.
         """
         rivals = [f for f in sure if f.is_steady and f.gain > ALIKE * first.gain]
-        net = {id(f): f.gain - self._left(f) for f in rivals} if len(rivals) > 1 else {}
-        alike = {
-            (f.name, *f.of[:2]): f for f in reversed(rivals) if net and net[id(f)] > max(net.values()) - LEAST_GAIN
-        }
-        one, *others = [*alike.values()][::-1] or [first]
-        return replace(one, alike=tuple(others))
+        net = [f.gain - self._left(f) for f in rivals]
+        equal = [f for f, gain in zip(rivals, net, strict=True) if gain > max(net) - LEAST_GAIN]
+        one, *others = {(f.name, *f.of[:2]): f for f in reversed(equal)}.values()
+        return replace(others[-1], alike=(*reversed(others[:-1]), one)) if others else one
 
     def _left(self, finding: Finding) -> float:
         """Return what another systematic error explains when one is taken out."""
         linear = without(self.linear, finding)
-        return max(
-            (f.gain for f in causes.systematic(linear, columns_of(linear, self.sensors, self.rates))), default=0.0
-        )
+        others = causes.systematic(linear, columns_of(linear, self.sensors, self.rates))
+        return max((f.gain for f in others), default=0.0)
 
     def _leave_out_explained(self) -> None:
         """Leave out noise and outliers that the causes found after them explain, and count what is left of the others.
 
         Each is put back into the data, one after the other.
         """
-        for finding in [f for f in self.found if f.takes_up and not f.overstated]:
+        for finding in [f for f in self.found if f.takes_up]:
             before = self.linear.scaled(*(None if of is None else 1.0 / of for of in (finding.noise, finding.errors)))
-            rest = causes.outliers(before, self.t_s) if finding.unit != causes.TIMES else self._noise(before)
-            again = [
-                f
-                for f in self._sure(rest, LEAST_GAIN)
-                if (f.name, f.of, f.overstated) == (finding.name, finding.of, False)
-            ]
-            self.found.remove(finding)
-            if again:
-                self.found.append(replace(finding, gain=again[0].gain))
-            else:
-                self.linear = before
-                self.simulated = before.simulated(causes.SETS)
+            sure = self._sure(self._any_misfit(before), LEAST_GAIN)
+            again = [replace(finding, gain=f.gain) for f in sure if (f.name, f.of) == (finding.name, finding.of)]
+            self.found = [f for f in self.found if f is not finding] + again
+            if not again:
+                self.linear, self.simulated = before, before.simulated(causes.SETS)
 
     def correlated(self) -> list[Finding]:
         """Return the errors that are correlated from one observation to the next."""
@@ -199,6 +188,7 @@ class Search:
         if finding.unit == causes.TIMES:
             finding = self._scaled(finding)
         else:
+            self.suspects = [f for f in self.suspects if f not in finding.alike]
             before, self.linear = self.linear, without(self.linear, finding)
             for other in (without(before, one) for one in finding.alike):
                 self.instead.append((other.z - self.linear.z, other.w - self.linear.w))

@@ -91,7 +91,7 @@ class Finding:
     @property
     def takes_up(self) -> bool:
         """True if it takes up any misfit: a noise that is larger, or outliers."""
-        return self.Z is None and (self.unit == TIMES or self.rows is not None)
+        return self.name == "outliers" or (self.unit == TIMES and self.value > 1.0)
 
     @property
     def overstated(self) -> bool:

@@ -48,7 +48,7 @@ TEXTS = {  # of one, and of several
 ANOTHER = ", and fit another one far more often than by chance"
 SECOND = " (2)"  # after an id, of what does not fit it
 CURE, OWN_ID = f"--set association.gate={GATE}", "give each thing an id of its own, and a thing that is moved a new one"
-SURVEY_CURE = "correct their places in the file of the survey, or leave them out"
+CURES = {PRIOR: "correct their places in the file of the survey, or leave them out"}
 
 
 def gated(config: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -98,7 +98,7 @@ def find_wrong_ids(run: Run, log: Log, now: Fit, trials: Trials) -> tuple[Mistak
     if gain < SURELY * mean and not by_itself:  # the filter may have left it out, which chance does seldom
         return None
     if found is not None and not mixed:
-        return found[0]._replace(cure=found[0].cure or cure, gain=max(gain, 0.0)), Filtered(found[1], log)
+        return found[0]._replace(cure=CURES.get(found[0].name, cure), gain=max(gain, 0.0)), Filtered(found[1], log)
     evidence = f"{out.mean():.1%} of the observations are far off where their landmark is"
     name, cure, told = (TWICE, cure, ANOTHER) if mixed else (OUTLIERS, CURE, "")
     without = first if found is None else found[1]
@@ -178,28 +178,24 @@ def _places_of_ids(
     """Return that ids mean other places, the log filtered with names for these, which, and how much likelier it is."""
     h, d = first.history, first.history.d
     surveys = {str(prior.landmark): prior.mean[:d] for prior in h.priors}
-    number = {name: (int((h.id == name).sum()), int((out & (h.id == name)).sum())) for name in np.unique(h.id[out])}
-    wrong = [str(i) for i, (n, k) in number.items() if k >= SHARE * n and (k >= LEAST or i in surveys)]
-    of_wrong = np.isin(h.id, wrong)
-    seen = {*h.id[np.argmax(of_wrong & out) :].tolist()} - {""}
-    if not wrong or len(wrong) > MOST * len(seen):
+    names, inverse, number = np.unique(h.id, return_inverse=True, return_counts=True)
+    number_out, surveyed = np.bincount(inverse, out), np.isin(names, [*surveys])
+    wrong = (number_out > 0) & (number_out >= SHARE * number) & (surveyed | (number_out >= LEAST))
+    rows = wrong[inverse] & out
+    if not 0 < wrong.sum() <= MOST * len({*h.id[np.argmax(rows) :].tolist()} - {""}):
         return None, [], 0.0
-    parts = [of_wrong & out, of_wrong & (out | np.isin(h.id, [*surveys]))]  # of a survey that is off all are elsewhere
-    runs = [
-        trials.filter(config, log, _renamed(log, first, np.flatnonzero(rows), _other))
-        for rows in parts[: 1 + (parts[0] != parts[1]).any()]
-    ]
+    parts = {part.tobytes(): part for part in (rows, wrong[inverse] & (out | surveyed[inverse]))}  # of a survey all
+    runs = [trials.filter(config, log, _renamed(log, first, np.flatnonzero(part), _other)) for part in parts.values()]
     tried = [(likelihood_gain(fit_of_run(first), fit_of_run(run)), run) for run in runs if run is not None]
     gain, again = max(tried, key=lambda of: of[0], default=(0.0, first))
     if again is first or fit_of_run(again).mean > FITS:
         return None, [], 0.0
-    told = _meanings(again, surveys, wrong)
+    told = _meanings(again, surveys, names[wrong].tolist())
     if not told:
         return None, [], 0.0
     since_s = _since_s(again, np.concatenate([_in_order(again.history, name)[-1][1] for name in told]))
     cause = PRIOR if {*told.values()} == {OFF_SURVEY} else MOVED if {*told.values()} <= {MOVES, GONE} else TWICE
-    evidence, cure = f"from t={since_s:.1f} s on {_together(told)}", SURVEY_CURE if cause == PRIOR else ""
-    mistake = Mistake(cause, evidence, cure, config, None, 0.0, since_s)
+    mistake = Mistake(cause, f"from t={since_s:.1f} s on {_together(told)}", CURE, config, None, 0.0, since_s)
     return (mistake, again), [*told], gain
 
 

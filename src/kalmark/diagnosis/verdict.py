@@ -284,8 +284,8 @@ def _of_less_certain_controls(run: Run, log: Log, most: int, trials: Trials) -> 
 def _suspects(search: Search | None, most: int) -> list[Finding]:
     """Return the likeliest errors of a search that are tried: those that are certain, and one that may explain more."""
     sure = _steady(search)[:most]
-    may_be, told = search.suspects[:1] if search else [], [(f.name, f.of) for one in sure for f in one.alike]
-    return sure + [f for f in may_be if (f.name, f.of) not in told and all(f.gain > one.gain for one in sure)]
+    may_be = search.suspects[:1] if search else []
+    return sure + [f for f in may_be if all(f.gain > one.gain for one in sure)]
 
 
 def _steady(search: Search | None) -> list[Finding]:
@@ -454,10 +454,11 @@ def _is_of_gap(run: Run, finding: Finding) -> bool:
     """Return whether a finding is an error of controls while there was none: then the gap is named."""
     if finding.W is None or not finding.W.any() or finding.since_s is None:
         return False
-    since_s = begin_s(run) + finding.since_s
-    until_s = begin_s(run) + finding.until_s if finding.begins else since_s
-    gaps = ((gap["robot"], gap["start_s"], gap["end_s"]) for gap in run.summary.get("gaps", ()) if gap["kind"] in KINDS)
-    return any(robot == finding.of[0] and a <= since_s and until_s <= b for robot, a, b in gaps)
+    since_s, until_s = (
+        begin_s(run) + t for t in (finding.since_s, finding.until_s if finding.begins else finding.since_s)
+    )
+    mine = (gap for gap in run.summary.get("gaps", ()) if (gap["robot"], gap["kind"] in KINDS) == (finding.of[0], True))
+    return any(gap["start_s"] <= since_s and until_s <= gap["end_s"] for gap in mine)
 
 
 def _increments_s(run: Run, robot: str) -> float:
@@ -850,9 +851,7 @@ def effect_of(run: Run, found: Searched) -> Effect:
     onto, extent = rigid(places, moved), rmse(moved - moved.mean(axis=0))
     robots = dict(_paths(run, found, onto, extent)) if len(rows) > d else {}
     off = _off(onto, places, moved, angle)
-    for z, w in found.search.instead:  # which of both is not known: the map is as good as with the worse one
-        other = replace(cured, z=cured.z + z, w=cured.w + w).moved().groups[LANDMARKS][its, :d]
-        off = max(off, _off(rigid(places, other), places, other, angle), key=rmse)
+    off = max([off, *_off_instead(found.search, places, its, angle)], key=rmse)
     by_steady = rmse(_off(rigid(places, steady), places, steady, angle))
     P = np.array([mapped[run.landmarks.ids[k]][1][:d, :d] for k in mine])
     (stated, bare_stated), (honest, bare_honest) = (_sigmas(each, places, its, ~lines) for each in (first, cured))
@@ -911,6 +910,14 @@ def _off(onto: Rigid, places: Array, moved: Array, angle: Array) -> Array:
         n = np.column_stack([np.cos(angle), np.sin(angle)])[lines] @ onto.rotation.T
         off[lines] = np.sum(off[lines] * n, axis=1, keepdims=True) * n
     return off
+
+
+def _off_instead(search: Search, places: Array, its: Index, angle: Array) -> Iterator[Array]:
+    """Yield by what landmarks move with what the log does not distinguish from a cause in its place: either may be."""
+    cured = search.linear
+    for z, w in search.instead:
+        moved = replace(cured, z=cured.z + z, w=cured.w + w).moved().groups[LANDMARKS][its, : places.shape[1]]
+        yield _off(rigid(places, moved), places, moved, angle)
 
 
 def _shared(run: Run, search: Search) -> Iterator[tuple[int, int]]:
