@@ -812,19 +812,23 @@ def test_noise_of_several_columns_is_no_outliers() -> None:
     assert verdict.map == "ok"
 
 
-def test_a_noise_that_was_taken_for_a_systematic_error_is_left_out_when_that_is_found() -> None:
+def test_a_noise_that_was_found_before_a_systematic_error_counts_what_that_leaves_of_it() -> None:
     again = copy(verdict_on(*FAULTS["range_scale"][:2]).search)
     assert again is not None
     again.linear, again.found, again.simulated = again.first, [], again.first.simulated(40)
     noise = next(f for f in again.candidates() if f.name == "range_sigma")
     scale = next(f for f in again.candidates() if f.name == "range_scale")
     assert noise.takes_up
-    assert again.likeliest([noise, scale]).name == "range_scale"  # whatever the noise gains with it in the data
+    assert again.likeliest([noise, scale]).name == "range_scale"
+    assert again.likeliest([replace(noise, gain=2.0 * scale.gain), scale]).name == "range_scale"
     again.take(noise)
-    again.take(scale)
+    again.take(next(f for f in again.candidates() if f.name == "range_scale"))
     again._leave_out_explained()
-    assert [f.name for f in again.found] == ["range_scale"]
-    assert again.linear.noise == pytest.approx(1.0)
+    left = {f.name: f for f in again.found}
+    assert left["range_scale"].gain > 20.0
+    if "range_sigma" in left:
+        assert left["range_sigma"].gain < 0.5 * noise.gain
+        assert left["range_sigma"].value < noise.value
 
 
 def test_an_error_of_controls_in_a_gap_of_them_is_no_cause() -> None:

@@ -23,7 +23,7 @@ ROUNDS, MORE = 6, 14  # in which all that is certain is taken out, and further o
 SHARE = (
     0.01  # of all that was explained: a log with many causes comes back to some of them, and more rounds are used up
 )
-ALIKE = 0.85  # of what the strongest explains: a systematic error that may be told in its place
+ALIKE = 0.85  # of the gain of the strongest: systematic errors that may be in its place
 MOST_CONDITION = 1e6  # of the information on errors of one column, as correlations
 SCALINGS, SCALED = 5, 0.03
 
@@ -45,17 +45,11 @@ def joined(same: list[Finding]) -> Finding:
     """Return the findings of one cause in several rounds as one."""
     first, last = same[0], same[-1]
     value = math.prod(f.value for f in same) if last.unit == causes.TIMES else sum(f.value for f in same)
-    noise, errors = (product(of) for of in ([f.noise for f in same], [f.errors for f in same]))
+    noise, errors = math.prod(f.noise for f in same), math.prod(f.errors for f in same)
     return replace(first, value=value, sigma=last.sigma, gain=total_gain(same), noise=noise, errors=errors)
 
 
-def product(factors: Iterable[Array | None]) -> Array | None:
-    """Return the product of the factors of a noise, None where there are none."""
-    known = [of for of in factors if of is not None]
-    return np.asarray(np.prod(known, axis=0)) if known else None
-
-
-def without(linear: Linear, finding: Finding) -> Linear:
+def problem_without(linear: Linear, finding: Finding) -> Linear:
     """Return a problem without a cause in its data."""
     if finding.Z is not None and finding.W is not None:
         linear = linear.without(finding.Z * finding.value, finding.W * finding.value)
@@ -73,9 +67,7 @@ class Search:
         at = np.searchsorted(linear.problem.nodes[order], poses)  # a pose at a fix has the time of the next scan
         self.t_s = ((t_ns - t_ns[:1].sum()) * 1e-9)[order[np.minimum(at, len(order) - 1)]]
         self.found: list[Finding] = []
-        self.instead: list[
-            tuple[Array, Array]
-        ] = []  # (z, w) of what the log does not distinguish from what was taken out
+        self.instead: list[tuple[Array, Array]] = []  # (z, w) of causes that may be in the place of one that is out
         self.suspects: list[Finding] = []  # systematic errors that explain most at first, sure or not
         self.simulated = linear.simulated(causes.SETS)
 
@@ -95,11 +87,12 @@ class Search:
                 self.suspects = sorted(steady, key=lambda f: -f.gain)
             least = max(LEAST_GAIN, SHARE * sum(f.gain for f in self.found) if n >= ROUNDS else 0.0)
             sure = self._sure(candidates, least)
-            harmful = [] if lasting else [f for f in sure if not f.overstated]
-            lasting = lasting or (not harmful and bool(self.correlated()))
-            if not sure or (lasting and not any(f.overstated for f in sure)):
+            wide, harmful = ([f for f in sure if f.overstated == which] for which in (True, False))
+            if not harmful or lasting:
+                lasting, harmful = lasting or bool(self.correlated()), wide
+            if not harmful:
                 break
-            self.take(self.likeliest(harmful or [f for f in sure if f.overstated]))
+            self.take(self.likeliest(harmful))
         self._leave_out_explained()
         for finding in self.correlated():
             self.take(finding)
@@ -116,7 +109,7 @@ class Search:
         """
         any_misfit, special = (strongest(f for f in sure if f.takes_up == which) for which in (True, False))
         if special and total_gain(any_misfit) > total_gain(special):
-            left = self._any_misfit(reduce(without, special, self.linear))
+            left = self._any_misfit(reduce(problem_without, special, self.linear))
             of = {(f.name, f.of) for f in any_misfit}
             if total_gain(f for f in left if (f.name, f.of) in of) > total_gain(special):
                 special = []
@@ -137,12 +130,12 @@ class Search:
         rivals = [f for f in sure if f.is_steady and f.gain > ALIKE * first.gain]
         net = [f.gain - self._left(f) for f in rivals]
         equal = [f for f, gain in zip(rivals, net, strict=True) if gain > max(net) - LEAST_GAIN]
-        one, *others = {(f.name, *f.of[:2]): f for f in reversed(equal)}.values()
-        return replace(others[-1], alike=(*reversed(others[:-1]), one)) if others else one
+        one, *others = [*{(f.name, *f.of[:2]): f for f in reversed(equal)}.values()][::-1]
+        return replace(one, alike=tuple(others))
 
     def _left(self, finding: Finding) -> float:
         """Return what another systematic error explains when one is taken out."""
-        linear = without(self.linear, finding)
+        linear = problem_without(self.linear, finding)
         others = causes.systematic(linear, columns_of(linear, self.sensors, self.rates))
         return max((f.gain for f in others), default=0.0)
 
@@ -152,17 +145,17 @@ class Search:
         Each is put back into the data, one after the other.
         """
         for finding in [f for f in self.found if f.takes_up]:
-            before = self.linear.scaled(*(None if of is None else 1.0 / of for of in (finding.noise, finding.errors)))
-            sure = self._sure(self._any_misfit(before), LEAST_GAIN)
-            again = [replace(finding, gain=f.gain) for f in sure if (f.name, f.of) == (finding.name, finding.of)]
-            self.found = [f for f in self.found if f is not finding] + again
-            if not again:
-                self.linear, self.simulated = before, before.simulated(causes.SETS)
+            self.found.remove(finding)
+            self.linear = self.linear.scaled(1.0 / finding.noise, 1.0 / finding.errors)
+            self.simulated = self.linear.simulated(causes.SETS)
+            for again in self._sure(self._any_misfit(self.linear), LEAST_GAIN):
+                if (again.name, again.of) == (finding.name, finding.of):
+                    self.take(again)
 
     def correlated(self) -> list[Finding]:
         """Return the errors that are correlated from one observation to the next."""
         found = causes.correlations(self.linear, self.simulated, self.sensors, self.t_s)
-        return [f for f in found if f.p * len(found) < ALPHA and f.gain > LEAST_GAIN]
+        return self._sure(found, LEAST_GAIN)
 
     def candidates(self) -> list[Finding]:
         """Return all that may explain what is left."""
@@ -189,13 +182,14 @@ class Search:
             finding = self._scaled(finding)
         else:
             self.suspects = [f for f in self.suspects if f not in finding.alike]
-            before, self.linear = self.linear, without(self.linear, finding)
-            for other in (without(before, one) for one in finding.alike):
+            before, self.linear = self.linear, problem_without(self.linear, finding)
+            for one in finding.alike:
+                other = problem_without(before, one)
                 self.instead.append((other.z - self.linear.z, other.w - self.linear.w))
-            if finding.noise is not None or finding.errors is not None:
-                self.simulated = self.linear.simulated(causes.SETS)
             if finding.is_steady:
                 finding = self._beside(finding)
+            else:
+                self.simulated = self.linear.simulated(causes.SETS)
         same = [
             f
             for f in self.found
@@ -229,17 +223,16 @@ class Search:
 
     def _scaled(self, finding: Finding) -> Finding:
         """Make a noise as large as it is, which takes a few rounds: other noise was taken for it, or it for other."""
-        value, step = 1.0, finding
+        steps, step = list[Finding](), finding
         for _ in range(SCALINGS):
             self._scale(step)
-            value *= step.value
+            steps.append(step)
             again = causes.noise(self.linear, self.simulated, self.sensors)
             step = next((f for f in again if (f.name, f.of) == (finding.name, finding.of)), step)
             if abs(step.value - 1.0) < SCALED:
                 break
-        by = (None if of is None else np.where(of == 1.0, 1.0, value) for of in (finding.noise, finding.errors))
-        noise, errors = by
-        return replace(finding, value=value, sigma=finding.sigma * value / finding.value, noise=noise, errors=errors)
+        one = joined(steps)
+        return replace(one, sigma=finding.sigma * one.value / finding.value, gain=finding.gain)
 
     def _scale(self, finding: Finding) -> None:
         self.linear = self.linear.scaled(finding.noise, finding.errors)

@@ -54,10 +54,7 @@ def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
     text = _TELL.get(finding.name) or (_noise if finding.unit == TIMES else _offset)
     evidence, cure = text(finding, config)
     if finding.alike:
-        others = ", ".join(
-            f"{other.name}{f' of {_sensor(other)}' if other.name == finding.name else ''} {_value(other)}"
-            for other in finding.alike
-        )
+        others = ", ".join(f"{other.name} of {_sensor(other)} {_value(other)}" for other in finding.alike)
         evidence += f"; the log does not distinguish this from {others}"
         cures = (cure, *(finding_text(other, config)[1] for other in finding.alike))
         cure = OR.join(dict.fromkeys(line for line in cures if line))

@@ -62,8 +62,8 @@ class Finding:
     unit: str = ""
     Z: Array | None = None
     W: Array | None = None
-    noise: Array | None = None
-    errors: Array | None = None
+    noise: Array | float = 1.0
+    errors: Array | float = 1.0
     rows: Flags | None = None
     since_s: float | None = None
     until_s: float = math.inf
@@ -222,14 +222,13 @@ def _ratio(value: float, simulated: Array) -> tuple[float, float] | None:
 
 
 def _noise(
-    name: str, of: tuple[str, ...], ratio: float, dof: float, noise: Flags | None = None, errors: Flags | None = None
+    name: str, of: tuple[str, ...], ratio: float, dof: float, noise: Flags | bool = False, errors: Flags | bool = False
 ) -> Finding:
     """Return the finding of a group of residuals, or of errors of the motion, of `ratio` times the variance."""
     gain = 0.5 * dof * (ratio - 1.0 - math.log(ratio))
     p = 2.0 * min(float(chdtrc(dof, ratio * dof)), float(chdtr(dof, ratio * dof)))
     value = math.sqrt(ratio)
-    factors = [None if group is None else np.where(group, value, 1.0) for group in (noise, errors)]
-    sigma = value / math.sqrt(2.0 * dof)
+    sigma, factors = value / math.sqrt(2.0 * dof), (np.where(noise, value, 1.0), np.where(errors, value, 1.0))
     return Finding(name, of, gain, min(p, 1.0), value, sigma, TIMES, noise=factors[0], errors=factors[1])
 
 

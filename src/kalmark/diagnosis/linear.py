@@ -78,10 +78,9 @@ class Linear:
         """State of the linearisation."""
         return self.base.state
 
-    def scaled(self, noise: Array | None, errors: Array | None) -> Linear:
+    def scaled(self, noise: Array | float, errors: Array | float) -> Linear:
         """Return it with the noise (N,) times and the motion's errors (r,) times as large."""
-        noise, errors = (have if by is None else have * by for have, by in ((self.noise, noise), (self.errors, errors)))
-        return replace(self, noise=noise, errors=errors)
+        return replace(self, noise=self.noise * noise, errors=self.errors * errors)
 
     def without(self, Z: Array, W: Array) -> Linear:
         """Return it with Z (N,), whitened as `at` is, and W (q n,) taken out of the data."""

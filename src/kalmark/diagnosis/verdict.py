@@ -442,9 +442,8 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
     A noise that is stated too large has no cure where its errors last: with it the filter would be overconfident.
     """
     again = restarts(run.history)  # their starts were made uncertain for the batch solution
-    matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
+    matter = [f for f in search.found if (f.moved_m or math.inf) >= accuracy_m and not _is_of_gap(run, f)]
     matter = [f for f in matter if f.name != "start" or not again]
-    matter = [f for f in matter if not _is_of_gap(run, f)]
     lasting = {f.of for f in matter if f.name == "correlated_noise"}
     causes = [(f, _cause(run, f, log)) for f in merge_jumps(matter, begin_s(run))]
     return [replace(c, cure="") if f.overstated and f.of in lasting else c for f, c in causes]
@@ -452,13 +451,11 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
 
 def _is_of_gap(run: Run, finding: Finding) -> bool:
     """Return whether a finding is an error of controls while there was none: then the gap is named."""
-    if finding.W is None or not finding.W.any() or finding.since_s is None:
-        return False
-    since_s, until_s = (
-        begin_s(run) + t for t in (finding.since_s, finding.until_s if finding.begins else finding.since_s)
-    )
+    since_s = begin_s(run) + (finding.since_s or 0.0)
+    until_s = begin_s(run) + finding.until_s if finding.begins else since_s
     mine = (gap for gap in run.summary.get("gaps", ()) if (gap["robot"], gap["kind"] in KINDS) == (finding.of[0], True))
-    return any(gap["start_s"] <= since_s and until_s <= gap["end_s"] for gap in mine)
+    within = any(gap["start_s"] <= since_s and until_s <= gap["end_s"] for gap in mine)
+    return within and finding.W is not None and bool(finding.W.any())
 
 
 def _increments_s(run: Run, robot: str) -> float:
