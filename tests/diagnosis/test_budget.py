@@ -12,6 +12,7 @@ import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis import trials
 from kalmark.diagnosis.gross_mistakes import likeliest
+from kalmark.diagnosis.mistakes import late_scans
 from kalmark.diagnosis.trials import CONTROL, HARDER, OBSERVATION, PART, SCAN, THOROUGH, Trials, work_of
 from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Control, Scan
@@ -121,3 +122,13 @@ def test_a_race_keeps_to_its_share_of_the_budget(monkeypatch: pytest.MonkeyPatch
     assert mistake is not None and mistake.name == "bearing_sign"
     assert engine.left_out["units, signs, columns, mounts and times"].startswith(" after ")
     assert budget - engine.work <= sum(taken) + PART * len(taken) < 0.6 * budget
+
+
+def test_an_error_whose_cure_is_not_paid_is_named_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    run, _ = run_of(False)
+    late = late_scans(run.config, "rover", 0.1)._replace(gain=100.0)
+    poor(monkeypatch)
+    monkeypatch.setattr("kalmark.diagnosis.verdict.gross", lambda *_: (late, None))
+    verdict = km.diagnose(run, 3000, brief=True)
+    assert (verdict.map, verdict.causes[0].name) == ("doubtful", "time_offset")
+    assert "the cure of time_offset" in verdict.left_out

@@ -197,7 +197,8 @@ def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
     if mistake.of:
         error = Finding(mistake.name, mistake.of, mistake.gain, 0.0, mistake.value, unit=mistake.unit)
         verdict = _with_cure(run, log, _judged(run, log, first, most, trials), alarmed, most, trials, error)
-        if _cure_of(error) not in trials.left_out or mistake.name in [c.name for c in verdict.causes]:
+        tried = len(run.history.d2) <= AT_ONCE and _cure_of(error) not in trials.left_out
+        if tried or mistake.name in [c.name for c in verdict.causes]:
             return verdict
         return replace(verdict, map=worst_status(verdict.map, DOUBTFUL), causes=(cause, *verdict.causes))
     if without is None:
@@ -240,8 +241,8 @@ def _with_cure(
         taken[key] = joined([*have, replace(one, gain=gain)])
         at = without, changed
         rest = _judged(*at, _structural(*at, []), most, trials)
-        least_gain = SHARE * sum(one.gain for one in taken.values())
-        tried = [f for f in _suspects(rest.search, 1) if f.gain > least_gain]
+        names, other = [f.name for f in taken.values()], SHARE * sum(f.gain for f in taken.values())
+        tried = [f for f in _suspects(rest.search, 1) if f.name in names or f.gain > other]
         if fit_of_run(without).mean > MISFITS_ALL:
             tried = chain(tried, _of_less_certain_controls(*at, most, trials))
     if not taken or sum(one.gain for one in taken.values()) < least:
