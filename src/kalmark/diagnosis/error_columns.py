@@ -150,13 +150,13 @@ def _longer(names: tuple[str, ...], e: Array) -> Array:
 
 
 def _of_controls(linear: Linear) -> Iterator[Column]:
-    """Yield the systematic errors of the controls.
+    """Yield the systematic errors of the controls, scales before offsets: the likelier of two that are alike.
 
     A scale is that of the control as estimated.  The measured one has its noise in it: its scale would come out short.
     """
     motions, nothing = linear.problem.motions, np.zeros(len(linear.at.z))
     e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds)
-    for k, error in enumerate(motions.errors):
+    for k, error in sorted(enumerate(motions.errors), key=lambda one: one[1].kind != "scale"):
         turns = error.column.endswith(("_rad", "_radps"))
         name = "odometry_turn" if turns else "odometry_scale" if error.kind == "scale" else "odometry_offset"
         if error.column == "steering_rad":
