@@ -371,7 +371,7 @@ class Task:
         wide: dict[Path_, float] = {}
         honest = linear
         for finding in found:
-            honest = honest.scaled(finding.noise, None)
+            honest = honest.scaled(finding.noise, 1.0)
             robot, sensor, column = finding.of
             stem, unit = column.rsplit("_", 1)
             for noise in components.noises:
