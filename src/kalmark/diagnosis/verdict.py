@@ -35,12 +35,12 @@ from kalmark.diagnosis.trials import (
     LOST,
     MOST,
     SOLVED,
+    Fit,
     Trials,
     fit_of_run,
     is_configured,
     likelihood_gain,
     with_cure,
-    work_of,
 )
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.errors import KalmarkError
@@ -232,13 +232,16 @@ def _with_cure(
     if not doubted and not any(f.name == LATE or f.begins for f in suspects):  # whose sizes are so far from linear
         return verdict
     tried: Iterable[Finding] = chain(also, suspects, _of_less_certain_controls(run, log, most, trials))
-    taken, at, rest = dict[tuple[str, ...], Finding](), (run, log), verdict
+    taken, at, rest, partly = dict[tuple[str, ...], Finding](), (run, log), verdict, False
     for _ in range(ROUNDS):
         gain, without, changed, one = _likeliest_cure(*at, tried, trials)
         if one is None or gain < LEAST_GAIN:
             break
         have = [taken[key]] if (key := (one.name, *one.of, str(one.since_s))) in taken else []
         taken[key] = joined([*have, replace(one, gain=gain)])
+        partly = without is at[0]
+        if partly:
+            break
         at = without, changed
         rest = _judged(*at, _structural(*at, []), most, trials)
         names, other = [f.name for f in taken.values()], SHARE * sum(f.gain for f in taken.values())
@@ -249,10 +252,10 @@ def _with_cure(
         return verdict
     causes = [_cause(run, f, log) for f in sorted(taken.values(), key=lambda f: -f.gain)]
     left = [c for c in rest.causes if c.name not in [f.name for f in taken.values()]]
-    worst = {c.name for c in verdict.causes[:1]}
+    worst = {c.name for c in verdict.causes[: 0 if partly else 1]}
     before = [c for c in left if c.name in worst and not c.harmless][:1]  # is not explained
     after = (c for c in left if c not in before)
-    status = worst_status(verdict.map, _bent(run, at[0])[0])
+    status = worst_status(verdict.map, _bent(run, at[0])[0], DOUBTFUL if partly else OK)
     return replace(verdict, map=status, causes=(*before, *causes, *after))
 
 
@@ -307,17 +310,23 @@ def _own_cure(run: Run, finding: Finding) -> str:
 
 
 def without_error(run: Run, log: Log, finding: Finding, trials: Trials) -> tuple[float, Run, Log, Finding]:
-    """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that."""
+    """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that.
+
+    Where the budget pays for the first part of the log alone, run and log are as they are.
+    """
     if finding.begins:
         changed = without_onset(run, log, finding)
         made = None if changed is None else (run.config, changed, list(changed.events))
     else:
         made = with_cure(run.config, log, _own_cure(run, finding))
-    paid = made is not None and trials.pays(_cure_of(finding), work_of(made[2]))
-    after = trials.filter(*made) if made is not None and paid else None
+    events = [] if made is None else trials.payable(_cure_of(finding), run, made[2], 1, 1)
+    after = trials.filter(*made[:2], events) if made is not None and events else None
     if made is None or after is None:
         return 0.0, run, log, finding
-    return likelihood_gain(fit_of_run(run), fit_of_run(after)), after, made[1], finding
+    now, then = fit_of_run(run), fit_of_run(after)
+    if len(events) == len(made[2]):
+        return likelihood_gain(now, then), after, made[1], finding
+    return likelihood_gain(Fit(*(column[: len(then.values)] for column in now)), then), run, log, finding
 
 
 def _bent(run: Run, without: Run) -> tuple[str, float]:
