@@ -50,7 +50,7 @@ def _resect_in_plane(v: Array, l: Array) -> Array:
 
 
 def _resect_by_three(v: Array, l: Array) -> list[Array]:
-    """Return the poses (7,) by three directions: a quartic.  Haralick, Lee, Ottenberg and Noelle 1994, (9) and (10).
+    """Return the poses (7,) by three directions: the law of cosines, a quartic in w.  Grunert 1841.
 
     The distances of the three are s (1, u, w), a, b and c those between them, opposite to each.  Of complex roots,
     which noise makes of a double one, it is the real part.
@@ -63,19 +63,12 @@ def _resect_by_three(v: Array, l: Array) -> list[Array]:
     cos_a, cos_b, cos_c = j[1] @ j[2], j[0] @ j[2], j[0] @ j[1]
     b2 = max(float(np.sum((p[0] - p[2]) ** 2)), 1e-300)
     a2, c2 = np.sum((p[1] - p[2]) ** 2) / b2, np.sum((p[0] - p[1]) ** 2) / b2
-    d = a2 - c2
-    quartic = (
-        (d - 1) ** 2 - 4 * c2 * cos_a**2,
-        4 * (d * (1 - d) * cos_b - (1 - a2 - c2) * cos_a * cos_c + 2 * c2 * cos_a**2 * cos_b),
-        2 * (d**2 - 1 + 2 * d**2 * cos_b**2 + 2 * (1 - c2) * cos_a**2)
-        - 8 * (a2 + c2) * cos_a * cos_b * cos_c + 4 * (1 - a2) * cos_c**2,
-        4 * (2 * a2 * cos_c**2 * cos_b - d * (1 + d) * cos_b - (1 - a2 - c2) * cos_a * cos_c),
-        (1 + d) ** 2 - 4 * a2 * cos_c**2,
-    )  # fmt: skip
+    B = np.poly1d([1.0, -2.0 * cos_b, 1.0])  # b^2 = s^2 B(w); a^2 - c^2 gives u = N(w) / D(w)
+    N, D = B * (a2 - c2) - np.poly1d([1.0, 0.0, -1.0]), np.poly1d([-2.0 * cos_a, 2.0 * cos_c])
+    quartic = N * N - N * D * (2.0 * cos_c) + D * D * (1.0 - B * c2)  # c^2 = s^2 (1 + u^2 - 2 u cos c)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for w in np.roots(quartic).real:
-            u = ((d - 1) * w**2 - 2 * d * cos_b * w + 1 + d) / (2 * (cos_c - w * cos_a))
-            s = np.sqrt(b2 / (1 + w**2 - 2 * w * cos_b)) * np.array([1.0, u, w])
+        for w in quartic.roots.real:
+            s = np.sqrt(b2 / B(w)) * np.array([1.0, N(w) / D(w), w])
             if np.isfinite(s).all() and (s > 0.0).all():
                 poses.append(align_points(s[:, None] * j, p, np.ones(3)))
     return poses

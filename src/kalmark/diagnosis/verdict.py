@@ -319,13 +319,16 @@ def without_error(run: Run, log: Log, finding: Finding, trials: Trials) -> tuple
         made = None if changed is None else (run.config, changed, list(changed.events))
     else:
         made = with_cure(run.config, log, _own_cure(run, finding))
-    events = [] if made is None else trials.payable(_cure_of(finding), run, made[2], 1, 1)
-    after = trials.filter(*made[:2], events) if made is not None and events else None
-    if made is None or after is None:
+    if made is None:
+        return 0.0, run, log, finding
+    config, changed, every = made
+    events = trials.payable(_cure_of(finding), run, every, 1, 1)
+    after = trials.filter(config, changed, events) if events else None
+    if after is None:
         return 0.0, run, log, finding
     now, then = fit_of_run(run), fit_of_run(after)
-    if len(events) == len(made[2]):
-        return likelihood_gain(now, then), after, made[1], finding
+    if len(events) == len(every):
+        return likelihood_gain(now, then), after, changed, finding
     return likelihood_gain(Fit(*(column[: len(then.values)] for column in now)), then), run, log, finding
 
 
