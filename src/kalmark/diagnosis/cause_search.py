@@ -130,7 +130,11 @@ class Search:
         rivals = [f for f in sure if f.is_steady and f.gain > ALIKE * first.gain]
         net = [f.gain - self._left(f) for f in rivals]
         equal = [f for f, gain in zip(rivals, net, strict=True) if gain > max(net) - LEAST_GAIN]
-        one, *others = [*{(f.name, *f.of[:2]): f for f in reversed(equal)}.values()][::-1]
+        likeliest = dict[tuple[str, ...], Finding]()
+        for f in equal:
+            cause = (f.name, *f.of[:2])
+            likeliest[cause] = max(likeliest.get(cause, f), f, key=lambda one: one.gain)
+        one, *others = likeliest.values()
         return replace(one, alike=tuple(others))
 
     def _left(self, finding: Finding) -> float:

@@ -238,7 +238,7 @@ def _with_cure(
         if one is None or gain < LEAST_GAIN:
             break
         have = [taken[key]] if (key := (one.name, *one.of, str(one.since_s))) in taken else []
-        taken[key] = joined([*have, replace(one, gain=gain)])
+        taken[key] = joined([*have, replace(one, gain=gain, noise=1.0, errors=1.0)])  # of other observations
         partly = without is at[0]
         if partly:
             break
