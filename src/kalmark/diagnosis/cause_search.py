@@ -130,11 +130,11 @@ class Search:
         rivals = [f for f in sure if f.is_steady and f.gain > ALIKE * first.gain]
         net = [f.gain - self._left(f) for f in rivals]
         equal = [f for f, gain in zip(rivals, net, strict=True) if gain > max(net) - LEAST_GAIN]
-        likeliest = dict[tuple[str, ...], Finding]()
+        of_cause = dict[tuple[str, ...], Finding]()
         for f in equal:
             cause = (f.name, *f.of[:2])
-            likeliest[cause] = max(likeliest.get(cause, f), f, key=lambda one: one.gain)
-        one, *others = likeliest.values()
+            of_cause[cause] = max(of_cause.get(cause, f), f, key=lambda one: one.gain)
+        one, *others = of_cause.values()
         return replace(one, alike=tuple(others))
 
     def _left(self, finding: Finding) -> float:

@@ -184,8 +184,9 @@ def _places_of_ids(
     rows = wrong[inverse] & out
     if not 0 < wrong.sum() <= MOST * len({*h.id[np.argmax(rows) :].tolist()} - {""}):
         return None, [], 0.0
-    parts = {part.tobytes(): part for part in (rows, wrong[inverse] & (out | surveyed[inverse]))}  # of a survey all
-    runs = [trials.filter(config, log, _renamed(log, first, np.flatnonzero(part), _other)) for part in parts.values()]
+    every = wrong[inverse] & (out | surveyed[inverse])  # of a survey that is off all observations are elsewhere
+    parts = [rows] if (rows == every).all() else [rows, every]
+    runs = [trials.filter(config, log, _renamed(log, first, np.flatnonzero(part), _other)) for part in parts]
     tried = [(likelihood_gain(fit_of_run(first), fit_of_run(run)), run) for run in runs if run is not None]
     gain, again = max(tried, key=lambda of: of[0], default=(0.0, first))
     if again is first or fit_of_run(again).mean > FITS:

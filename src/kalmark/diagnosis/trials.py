@@ -127,8 +127,8 @@ class Trials:
     """The filter of the changed logs of a verdict, and the budget of their work.
 
     `work` is a count, the same on every machine: of events, observations (`work_of`) and filters, as a robot that may
-    be in several places has one for each.  `left_out` has the searches that were not paid, in words,
-    and since when those were not that were paid in part.
+    be in several places has one for each.  `left_out` has the searches that were not paid, in words, and after how many
+    scans those end that were paid in part, "" of one that was not made.
     """
 
     def __init__(self, work: float = UNLIMITED, progress: bool = False) -> None:
@@ -165,7 +165,7 @@ class Trials:
     ) -> list[Event]:  # fmt: skip
         """Return the first of some events, those that a share of the budget pays to filter so often in so many parts.
 
-        None if these have few scans.  The rest is named.
+        None of them if these have few scans.  The search is named with the number that it has.
         """
         paid = share * self.work / max(filters * work_of(events) + PART * parts, 1.0)
         if paid >= 1.0:

@@ -455,8 +455,8 @@ def causes_of(run: Run, search: Search, accuracy_m: float = 0.0, log: Log | None
     A noise that is stated too large has no cure where its errors last: with it the filter would be overconfident.
     """
     again = restarts(run.history)  # their starts were made uncertain for the batch solution
-    matter = [f for f in search.found if (f.moved_m or math.inf) >= accuracy_m and not _is_of_gap(run, f)]
-    matter = [f for f in matter if f.name != "start" or not again]
+    matter = [f for f in search.found if f.moved_m is None or f.moved_m >= accuracy_m]
+    matter = [f for f in matter if not (_is_of_gap(run, f) or (f.name == "start" and again))]
     lasting = {f.of for f in matter if f.name == "correlated_noise"}
     causes = [(f, _cause(run, f, log)) for f in merge_jumps(matter, begin_s(run))]
     return [replace(c, cure="") if f.overstated and f.of in lasting else c for f, c in causes]

@@ -276,7 +276,7 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
 
 
 def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis, fits: Sequence[Id]) -> None:
-    """Move a robot to where its second hypothesis is; what was mapped while it was elsewhere goes.
+    """Move a robot to where its second hypothesis is, with its constants; what was mapped while it was elsewhere goes.
 
     Its error is that of the second hypothesis, and that of the map there, which the second hypothesis does not have: of
     the pose of which the landmarks l that it sees are least squares, d r = (sum A'A)^-1 sum A' d l, A = d l / d r.
