@@ -227,7 +227,7 @@ def _with_cure(
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
     if len(run.history.d2) > AT_ONCE:
-        trials.left_out |= {f"cures in a log of more than {AT_ONCE} observations": ""} if doubted else {}
+        trials.left_out |= {f"cures (tried in logs of up to {AT_ONCE} observations)": ""} if doubted else {}
         return verdict
     if not doubted and not any(f.name == LATE or f.begins for f in suspects):  # whose sizes are so far from linear
         return verdict
