@@ -18,8 +18,9 @@ from typing import NamedTuple
 from kalmark.config import build_slam
 from kalmark.config.building import config_dict
 from kalmark.diagnosis.mistakes import change_measurements
+from kalmark.diagnosis.named_causes import MISFIT
 from kalmark.diagnosis.state_readings import ARM, CONSTANT, NAMES, SCALE, SIGMA, SIGN
-from kalmark.diagnosis.verdict import MISFIT, diagnose
+from kalmark.diagnosis.verdict import diagnose
 from kalmark.results.record import record
 from kalmark.simulate import load_world, simulate
 

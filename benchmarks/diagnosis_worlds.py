@@ -19,7 +19,8 @@ import numpy as np
 
 from diagnosis import kidnapped, none, seen
 from kalmark.config import build_slam
-from kalmark.diagnosis.verdict import LEAST, MOST_OFF, SIGMAS, diagnose
+from kalmark.diagnosis.effect import LEAST, MOST_OFF, SIGMAS
+from kalmark.diagnosis.verdict import diagnose
 from kalmark.events import Control, Fix, Scan, sort_key
 from kalmark.logs.log import Log
 from kalmark.results.measures import rigid, rmse

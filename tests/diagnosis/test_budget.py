@@ -11,11 +11,12 @@ import pytest
 import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis import trials
-from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.batch_verdict import judged
+from kalmark.diagnosis.cures import with_cures
 from kalmark.diagnosis.gross_mistakes import likeliest
 from kalmark.diagnosis.mistakes import late_scans
 from kalmark.diagnosis.trials import CONTROL, HARDER, OBSERVATION, PART, SCAN, THOROUGH, Trials, work_of
-from kalmark.diagnosis.verdict import Verdict, without_error
+from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Control, Scan
 from kalmark.logs.log import Log
 from kalmark.results.record import Recorder
@@ -132,18 +133,18 @@ def test_an_error_whose_cure_is_not_paid_is_named_all_the_same(monkeypatch: pyte
     monkeypatch.setattr("kalmark.diagnosis.verdict.gross", lambda *_: (late, None))
     verdict = km.diagnose(run, 3000, brief=True)
     assert (verdict.map, verdict.causes[0].name) == ("doubtful", "time_offset")
-    assert "the cure of time_offset" in verdict.left_out
+    assert "cures of small errors" in verdict.left_out
 
 
-def test_a_cure_is_tried_on_the_first_part_of_a_log_that_the_budget_pays() -> None:
+def test_cures_are_tried_on_the_first_part_of_a_log_that_the_budget_pays() -> None:
     run, log = run_of(False)
     events = [replace(e, t_ns=e.t_ns + 150_000_000) if isinstance(e, Scan) else e for e in log.events]
     late = replace(log, events=sorted(events, key=trials.sort_key))
     again = Trials().filter(run.config, late, late.events)
     assert again is not None
-    mistake = late_scans(run.config, "rover", -0.15)
-    finding = Finding(mistake.name, mistake.of, 0.0, 0.0, mistake.value, unit=mistake.unit)
-    gain, without, _, _ = without_error(again, late, finding, Trials())
-    part, *same = without_error(again, late, finding, Trials(0.6 * work_of(late.events)))
-    assert without is not again and gain > part > trials.SURELY
-    assert same == [again, late, finding]
+    engine = Trials(20.0 * (work_of(late.events) + PART))
+    verdict = with_cures(again, late, judged(again, late, [], 3000, Trials()), True, 3000, engine)
+    assert engine.left_out["cures of small errors"].startswith(" after ")
+    assert verdict.causes[0].name == "time_offset"
+    (line,) = trials.options_of(verdict.causes[0].cure)
+    assert float(line.partition("=")[2]) == pytest.approx(-0.15, abs=0.01)

@@ -30,9 +30,10 @@ from kalmark.diagnosis.breakdown import breakdown, nees_parts
 from kalmark.diagnosis.cause_texts import OR, finding_text
 from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.linear import Linear
+from kalmark.diagnosis.named_causes import _is_of_gap, causes_of
 from kalmark.diagnosis.repeated_events import repeated_measurements
 from kalmark.diagnosis.trials import fit_of_run
-from kalmark.diagnosis.verdict import Verdict, _is_of_gap, causes_of
+from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.spaces import SE3
@@ -163,7 +164,7 @@ def test_a_log_that_does_not_fit_is_not_ok_where_there_is_no_batch_solution(monk
     def unsolved(*given: Any) -> Any:
         raise km.KalmarkError("not determined")
 
-    monkeypatch.setattr("kalmark.diagnosis.verdict.search_causes", unsolved)
+    monkeypatch.setattr("kalmark.diagnosis.batch_verdict.search_causes", unsolved)
     assert km.diagnose(run_of()).map == "ok"
     verdict = km.diagnose(run_of(measuring(lambda y: np.add(y, [0.0, 0.5 * np.sin(3 * y[0, 0])]))))
     assert verdict.map != "ok"

@@ -10,9 +10,10 @@ import pytest
 import kalmark as km
 from kalmark.config.building import build_slam, config_dict
 from kalmark.diagnosis.mistakes import change_measurements
+from kalmark.diagnosis.named_causes import MISFIT
 from kalmark.diagnosis.state_readings import NAMES, reasons
 from kalmark.diagnosis.trials import Trials
-from kalmark.diagnosis.verdict import MISFIT, diagnose
+from kalmark.diagnosis.verdict import diagnose
 from kalmark.simulate import load_world
 from kalmark.simulate.robots import Simulation, simulation
 

@@ -237,7 +237,7 @@ def test_the_events_of_a_long_log_are_read_one_by_one_in_little_memory(tmp_path:
         pytest.skip("only Linux tells how much memory was used")
     done = subprocess.run([sys.executable, "-c", MANY, tmp_path, "60000"], capture_output=True, text=True, check=True)
     count, grown_kb = map(int, done.stdout.split())
-    assert count == 90_000 and grown_kb < 4000  # kept, they would have 30 MB
+    assert count == 90_000 and grown_kb < 8000  # kept, they would have 30 MB
 
 
 def test_events_read_one_by_one_are_those_of_the_log(tmp_path: Path) -> None:

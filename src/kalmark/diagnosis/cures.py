@@ -1,0 +1,209 @@
+"""Small errors are taken out of a log by their cures, one after the other, as long as it gets likelier."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from kalmark.diagnosis.batch_search import MORE, associated, search_causes
+from kalmark.diagnosis.batch_verdict import Verdict, judged
+from kalmark.diagnosis.cause_search import SHARE, Search, joined
+from kalmark.diagnosis.cause_texts import finding_text
+from kalmark.diagnosis.causes import LEAST_GAIN, TIMES, Finding
+from kalmark.diagnosis.effect import shape_without
+from kalmark.diagnosis.mistakes import LATE
+from kalmark.diagnosis.named_causes import cause_of
+from kalmark.diagnosis.onsets import without_onset
+from kalmark.diagnosis.structural_causes import structural_causes
+from kalmark.diagnosis.trials import AT_ONCE, FITS, SOLVED, Trials, fit_of_run, likelihood_gain, with_cure, work_of
+from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
+from kalmark.errors import KalmarkError
+from kalmark.logs.log import Log
+from kalmark.results.checked import OK, worst_status
+from kalmark.results.run import Run
+
+CURES = "cures of small errors"
+TRIED, ROUNDS = 2, 3  # errors that are tried, and rounds of what is left without the likeliest
+SIZES, SAME = 6, 0.05  # of an error that are tried, and the share by which the last one may change it
+
+Cured = tuple[float, Run, Log, Finding | None]  # the gain of a cure, the run and log with it, and the error
+
+
+class _Taken(NamedTuple):
+    """Errors that are taken out of a log, by name, the run and log without them, and the verdict on that.
+
+    `systematic` is run and log without the systematic errors, the noise as it was stated.
+    """
+
+    errors: dict[tuple[str, ...], Finding]
+    run: Run
+    log: Log
+    rest: Verdict
+    systematic: tuple[Run, Log]
+
+    @property
+    def gain(self) -> float:
+        """The log-likelihood that all of them gain."""
+        return sum(one.gain for one in self.errors.values())
+
+
+def with_cures(
+    run: Run, log: Log, verdict: Verdict, alarmed: bool, most: int, trials: Trials, *also: Finding,
+    least: float = 0.0,
+) -> Verdict:  # fmt: skip
+    """Return a verdict in which the small errors with which the log is likeliest are taken out by their cures.
+
+    That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
+    All together have to gain `least`.  They are tried on the first part of a log, where the budget does not pay for all
+    of it.
+    """
+    suspects = _suspects(verdict.search, TRIED)
+    doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
+    doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
+    if not doubted and not any(f.name == LATE or f.begins for f in suspects):  # whose sizes are so far from linear
+        return verdict
+    part, part_log = _paid_part(run, log, trials)
+    if part is None:
+        return verdict
+    tried = chain(also, suspects, _of_less_certain_controls(part, part_log, most, trials))
+    taken = _taken_out(part, part_log, verdict, tried, most, trials)
+    if not taken.errors or taken.gain < least:
+        return verdict
+    found = sorted(taken.errors.values(), key=lambda f: -f.gain)
+    names, after = [f.name for f in found], taken.rest
+    if part is not run:  # the causes of all of the log, but for noise that the part has no more
+        noise = {f.name for f in steady_errors(verdict.search) if f.unit == TIMES} - {c.name for c in taken.rest.causes}
+        names, after = [*names, *noise], verdict
+    left = [c for c in after.causes if c.name not in names]
+    worst = {c.name for c in verdict.causes[:1]} if part is run else set()
+    before = [c for c in left if c.name in worst and not c.harmless][:1]  # is not explained
+    causes = *before, *(cause_of(run, f, log) for f in found), *(c for c in left if c not in before)
+    return replace(verdict, map=worst_status(verdict.map, shape_without(part, taken.run)[0]), causes=causes)
+
+
+def _paid_part(run: Run, log: Log, trials: Trials) -> tuple[Run | None, Log]:
+    """Return the run of the first part of a log for which the budget pays the cures, all of it if it does, and that."""
+    work = work_of(log.events)
+    filters = TRIED + SIZES + ROUNDS * (1.0 + SOLVED * len(run.history.d2) / work)
+    events = trials.payable(CURES, run, [*log.events], filters, TRIED + SIZES + ROUNDS)
+    if len(events) == len(log.events):
+        return run, log
+    part = replace(log, events=events)
+    return trials.filter(run.config, part, events) if events else None, part
+
+
+def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], most: int, trials: Trials) -> _Taken:
+    """Take out the likeliest of the errors that are `tried`, then what the log without it shows, in a few rounds.
+
+    A systematic error is taken out of the log with the noise as it was stated: more noise is what is left.
+    """
+    taken = _Taken({}, run, log, verdict, (run, log))
+    for _ in range(ROUNDS):
+        best, errors = _likeliest_cure(taken.run, taken.log, tried, trials), taken.errors
+        if best[3] is not None and best[3].unit != TIMES:
+            best = _of_likeliest_size(*taken.systematic, best[3], trials)
+            errors = {key: one for key, one in errors.items() if one.unit != TIMES}
+        gain, without, changed, one = best
+        if one is None or gain < LEAST_GAIN:
+            break
+        key = one.name, *one.of, str(one.since_s)
+        have = [errors[key]] if key in errors else []
+        now = joined([*have, replace(one, gain=gain, noise=1.0, errors=1.0)])  # of other observations
+        rest = judged(without, changed, structural_causes(without, changed, []), most, trials)
+        systematic = taken.systematic if one.unit == TIMES else (without, changed)
+        taken = _Taken(errors | {key: now}, without, changed, rest, systematic)
+        names = [name for name, *_ in taken.errors]
+        tried = [f for f in _suspects(rest.search, 1) if f.name in names or f.gain > SHARE * taken.gain]
+        if fit_of_run(without).mean > MISFITS_ALL:
+            tried = chain(tried, _of_less_certain_controls(without, changed, most, trials))
+    return taken
+
+
+def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding], trials: Trials) -> Cured:
+    """Return the cure with which the log of a run is likeliest, as `without_error`.
+
+    After one with which a log fits that did not, only other sizes of that error are tried.
+    """
+    best: Cured = 0.0, run, log, None
+    fitted, named, work = fit_of_run(run).mean < FITS, "", work_of(log.events)
+    for finding in tried:
+        if named in ("", finding.name) and trials.pays(CURES, work):
+            best = max(best, without_error(run, log, finding, trials), key=lambda of: of[0])
+        if not fitted and best[3] is not None and fit_of_run(best[1]).mean < FITS:
+            named = best[3].name
+    return best
+
+
+def _of_likeliest_size(run: Run, log: Log, finding: Finding, trials: Trials) -> Cured:
+    """Return the cure of a systematic error, of late scans of the size with which the log of a run is likeliest.
+
+    It is doubled as long as that gains; then a parabola through three sizes has the next one.
+    """
+    best: Cured = 0.0, run, log, None
+    work, tried, size = work_of(log.events), {0.0: 0.0}, finding.value
+    while (
+        len(tried) < (SIZES if finding.name == LATE else 2)
+        and min(abs(size - one) for one in tried) >= SAME * abs(size)
+        and trials.pays(CURES, work)
+    ):
+        again = without_error(run, log, replace(finding, value=size), trials)
+        tried[size] = again[0]
+        best, size = max(best, again, key=lambda of: of[0]), _next_size(tried)
+    return best
+
+
+def _next_size(tried: Mapping[float, float]) -> float:
+    """Return the size to try next, of sizes with their gains, all of one sign."""
+    sizes = sorted(tried, key=abs)
+    k = max(range(len(sizes)), key=lambda k: tried[sizes[k]])
+    if k in (0, len(sizes) - 1):
+        return 2.0 * sizes[k] if k else 0.5 * sizes[1]
+    a, b, c = sizes[k - 1 : k + 2]
+    left, right = (tried[b] - tried[a]) / (b - a), (tried[c] - tried[b]) / (c - b)
+    return 0.5 * (a + b - left * (c - a) / (right - left))
+
+
+def _of_less_certain_controls(run: Run, log: Log, most: int, trials: Trials) -> Iterator[Finding]:
+    """Yield the systematic errors that a search finds by associations of less certain controls."""
+    wide = associated(run, log, trials)
+    if wide is not run:
+        with suppress(KalmarkError, np.linalg.LinAlgError):
+            search = search_causes(wide, log, most, max(AT_ONCE, MORE * most), trials).search
+            yield from [f for f in steady_errors(search) if f.unit != TIMES][:TRIED]
+
+
+def _suspects(search: Search | None, most: int) -> list[Finding]:
+    """Return the likeliest errors of a search that are tried: those that are certain, and one that may explain more."""
+    sure = steady_errors(search)[:most]
+    may_be = search.suspects[:1] if search else []
+    return sure + [f for f in may_be if all(f.gain > one.gain for one in sure)]
+
+
+def steady_errors(search: Search | None) -> list[Finding]:
+    """Return the systematic errors and larger noise that a search found, the one that explains most first."""
+    found = search.found if search else ()
+    steady = (f for f in found if f.is_steady or f.begins or (f.unit == TIMES and not f.overstated))
+    return sorted(steady, key=lambda f: -f.gain)
+
+
+def own_cure(run: Run, finding: Finding) -> str:
+    """Return the line that cures a finding, without those of others that explain as much."""
+    return finding_text(replace(finding, alike=()), run.config)[1]
+
+
+def without_error(run: Run, log: Log, finding: Finding, trials: Trials) -> Cured:
+    """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that."""
+    if finding.begins:
+        changed = without_onset(run, log, finding)
+        made = None if changed is None else (run.config, changed, list(changed.events))
+    else:
+        made = with_cure(run.config, log, own_cure(run, finding))
+    after = None if made is None else trials.filter(*made)
+    if made is None or after is None:
+        return 0.0, run, log, finding
+    return likelihood_gain(fit_of_run(run), fit_of_run(after)), after, made[1], finding
