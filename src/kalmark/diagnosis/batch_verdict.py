@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from kalmark.diagnosis.effect import TOO_SURE, Effect, effect_of
 from kalmark.diagnosis.named_causes import (
     COPIES,
     MISFIT,
+    OF_MAP,
     Cause,
     all_misfit,
     begin_s,
@@ -23,6 +24,7 @@ from kalmark.diagnosis.named_causes import (
     odd_controls,
     status_of,
 )
+from kalmark.diagnosis.single_ids import OUTLIERS
 from kalmark.diagnosis.trials import AT_ONCE, SOLVED, Trials
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
@@ -92,7 +94,9 @@ def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdic
     effect = effect_of(run, found)
     moved = [f for f in found.search.found if is_misplaced_survey(run, f)]
     status = worst_status(effect.status, status_of(first), DOUBTFUL if moved else OK)
-    causes = [*first, *(c for c in _found(run, log, first, found, effect) if c not in first)]
+    of_map = [c for c in first if c.name in OF_MAP]
+    causes = [*of_map, *(c for c in _found(run, log, first, found, effect) if c not in first)]
+    causes = [c for c in first if c not in of_map] + sorted(causes, key=lambda c: -c.score)
     causes.sort(key=lambda c: c.harmless)
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
@@ -100,13 +104,17 @@ def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdic
 
 
 def _found(run: Run, log: Log, first: list[Cause], found: Searched, effect: Effect) -> list[Cause]:
-    """Return the causes that a search found, and controls that jump: between segments it looks for no jumps."""
+    """Return the causes that a search found, and controls that jump: between segments it looks for no jumps.
+
+    Outliers do no harm to a map that is the same without them.
+    """
     causes = causes_of(run, found.search, effect.accuracy_m or 0.0, log)
     if found.given.segments is not None and not any(cause.name in JUMPS for cause in causes):
         causes += odd_controls(run, log)
     if not any(cause.name == COPIES for cause in first):  # then that makes the filter overconfident
         causes += _too_sure(run, effect)
-    return sorted(causes, key=lambda cause: -cause.score)
+    fine = effect.status == OK
+    return [replace(cause, harmless=True) if cause.name == OUTLIERS and fine else cause for cause in causes]
 
 
 def _too_sure(run: Run, effect: Effect) -> Iterator[Cause]:

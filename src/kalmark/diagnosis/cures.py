@@ -20,7 +20,7 @@ from kalmark.diagnosis.mistakes import LATE
 from kalmark.diagnosis.named_causes import cause_of
 from kalmark.diagnosis.onsets import without_onset
 from kalmark.diagnosis.structural_causes import structural_causes
-from kalmark.diagnosis.trials import AT_ONCE, FITS, SOLVED, Trials, fit_of_run, likelihood_gain, with_cure, work_of
+from kalmark.diagnosis.trials import AT_ONCE, FITS, SOLVED, Trials, fit_of_run, likelihood_gain, with_cure
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
@@ -88,7 +88,7 @@ def with_cures(
 
 def _paid_part(run: Run, log: Log, trials: Trials) -> tuple[Run | None, Log]:
     """Return the run of the first part of a log for which the budget pays the cures, all of it if it does, and that."""
-    work = work_of(log.events)
+    work = trials.work_of(log.events)
     filters = TRIED + SIZES + ROUNDS * (1.0 + SOLVED * len(run.history.d2) / work)
     events = trials.payable(CURES, run, [*log.events], filters, TRIED + SIZES + ROUNDS)
     if len(events) == len(log.events):
@@ -130,7 +130,7 @@ def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding], trials: Trials
     After one with which a log fits that did not, only other sizes of that error are tried.
     """
     best: Cured = 0.0, run, log, None
-    fitted, named, work = fit_of_run(run).mean < FITS, "", work_of(log.events)
+    fitted, named, work = fit_of_run(run).mean < FITS, "", trials.work_of(log.events)
     for finding in tried:
         if named in ("", finding.name) and trials.pays(CURES, work):
             best = max(best, without_error(run, log, finding, trials), key=lambda of: of[0])
@@ -145,7 +145,7 @@ def _of_likeliest_size(run: Run, log: Log, finding: Finding, trials: Trials) -> 
     It is doubled as long as that gains; then a parabola through three sizes has the next one.
     """
     best: Cured = 0.0, run, log, None
-    work, tried, size = work_of(log.events), {0.0: 0.0}, finding.value
+    work, tried, size = trials.work_of(log.events), {0.0: 0.0}, finding.value
     while (
         len(tried) < (SIZES if finding.name == LATE else 2)
         and min(abs(size - one) for one in tried) >= SAME * abs(size)

@@ -31,7 +31,6 @@ from kalmark.diagnosis.trials import (
     fit_of_run,
     likelihood_gain,
     log_from,
-    work_of,
 )
 from kalmark.events import Control, Event, Fix, Scan
 from kalmark.geometry.frames3d import to_euler_pose
@@ -67,7 +66,7 @@ def gross(run: Run, log: Log, trials: Trials, alarmed: bool = False) -> tuple[Mi
     fits = now.mean < MISFIT and not run.stopped and first is None
     alone = None if fits and not alarmed else likeliest(run, log, trials, first)
     if alone is not None and of_ids is not None and first is None:  # found in the first events, compared in all
-        paid = trials.pays(f"{alone.name}, compared with {of_ids[0].name}", work_of(log.events))
+        paid = trials.pays(f"{alone.name}, compared with {of_ids[0].name}", trials.work_of(log.events))
         alone = alone._replace(gain=likelihood_gain(now, trials.fit_with(log, log.events, alone)) if paid else 0.0)
     if alone is None or (of_ids is not None and alone.gain < of_ids[0].gain):
         return of_ids
@@ -97,7 +96,7 @@ def likeliest(run: Run, log: Log, trials: Trials, first: int | None = None) -> M
         return found
     every = next(one for one in changes_of(run, run.config, events) if found.evidence.startswith(one.evidence))
     before = [e for e in log.events if e.t_ns < events[0].t_ns]
-    paid = trials.pays(f"{MISTAKES} before t={found.since_s:.1f} s", 2.0 * work_of(before))
+    paid = trials.pays(f"{MISTAKES} before t={found.since_s:.1f} s", 2.0 * trials.work_of(before))
     both = (trials.fit_with(log, before, one) for one in (none._replace(config=run.config), every))
     if paid and likelihood_gain(next(both), next(both)) > -SURELY:
         return every._replace(evidence=found.evidence, gain=found.gain, since_s=log.events[0].t_s)
@@ -141,7 +140,7 @@ def find_wrong_starts(run: Run, log: Log, trials: Trials) -> Mistake | None:
     events, config, told, begin_s = first_events(run, log), run.config, [], math.inf
     again = restarts(run.history)  # of these the map was moved onto their fixes
     lost = [start for start in run.history.starts if start.robot not in again and _is_lost(run, start.robot)]
-    if not trials.pays("other starts", (1 + len(lost)) * work_of(events) if lost else 0):
+    if not trials.pays("other starts", (1 + len(lost)) * trials.work_of(events) if lost else 0):
         return None
     for start in lost:
         found = _onto_its_fixes(run, log, events, start, trials)

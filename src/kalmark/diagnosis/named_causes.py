@@ -27,6 +27,7 @@ from kalmark.results.wrong_starts import restarts
 JUMP = "odometry_jump"  # the cause of controls that state a motion that did not take place
 COPIES = "copies"  # the cause that events come twice
 MISFIT = "misfit"  # the cause of innovations that do not fit, without an explanation
+OF_MAP = "map_repeats", "unseen_landmarks", "split_landmarks", "lost"  # other causes may explain them
 SEVERITY = dict.fromkeys((*JUMPS, "map_repeats", "lost"), WRONG) | {COPIES: OK}  # the others: doubtful
 
 
@@ -92,7 +93,7 @@ def _is_of_gap(run: Run, finding: Finding) -> bool:
     """Return whether a finding is an error of controls while there was none: then the gap is named."""
     since_s = begin_s(run) + (finding.since_s or 0.0)
     until_s = begin_s(run) + finding.until_s if finding.begins else since_s
-    mine = (gap for gap in run.summary.get("gaps", ()) if (gap["robot"], gap["kind"] in KINDS) == (finding.of[0], True))
+    mine = (gap for gap in run.summary.get("gaps", ()) if gap["kind"] in KINDS and gap["robot"] in finding.of[:1])
     within = any(gap["start_s"] <= since_s and until_s <= gap["end_s"] for gap in mine)
     return within and finding.W is not None and bool(finding.W.any())
 

@@ -18,7 +18,7 @@ from scipy.special import rel_entr
 
 from kalmark.arrays import Array, Flags
 from kalmark.diagnosis.mistakes import Mistake, with_value
-from kalmark.diagnosis.trials import AT_ONCE, FITS, SURELY, Fit, Trials, fit_of_run, likelihood_gain, log_from, work_of
+from kalmark.diagnosis.trials import AT_ONCE, FITS, SURELY, Fit, Trials, fit_of_run, likelihood_gain, log_from
 from kalmark.events import Event, Scan
 from kalmark.geometry.gaussian import gate
 from kalmark.logs.log import Log
@@ -77,7 +77,7 @@ def find_wrong_ids(run: Run, log: Log, now: Fit, trials: Trials) -> tuple[Mistak
     if not whole:
         config, log, now = _part(run, log, now, far)
     as_it_is = whole and config == run.config
-    if not trials.pays("wrong ids", (1 if as_it_is else 2) * work_of(log.events)):
+    if not trials.pays("wrong ids", (1 if as_it_is else 2) * trials.work_of(log.events)):
         return None
     first = run if as_it_is else trials.filter(config, log, log.events)
     if first is None:

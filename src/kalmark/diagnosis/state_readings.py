@@ -28,7 +28,6 @@ from kalmark.diagnosis.trials import (
     first_of,
     fit_of_run,
     likelihood_gain,
-    work_of,
 )
 from kalmark.events import Event
 from kalmark.geometry.gaussian import quantile
@@ -277,7 +276,7 @@ def _same(told: tuple[str, str], _: FilteredRun) -> tuple[str, str]:
 
 def _is_paid(engine: Trials, now: FilteredRun, number: int, events: list[Event]) -> bool:
     """Return whether readings are still off, and a search for their next cause is in the budget."""
-    return bool(now.off()) and engine.pays(f"further causes in {READINGS}", number * work_of(events))
+    return bool(now.off()) and engine.pays(f"further causes in {READINGS}", number * engine.work_of(events))
 
 
 def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], FilteredRun | None]:

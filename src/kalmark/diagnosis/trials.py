@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
@@ -22,7 +22,7 @@ from kalmark.config import build_slam
 from kalmark.config.reading import config_of
 from kalmark.config.tree import Tree, parse_value
 from kalmark.diagnosis.cause_texts import OR
-from kalmark.diagnosis.mistakes import Mistake, configured_value, robot_section, with_value
+from kalmark.diagnosis.mistakes import Mistake, Where, configured_value, robot_section, with_value
 from kalmark.errors import KalmarkError, LogError
 from kalmark.events import Event, Frame, Raw, Scan, sort_key
 from kalmark.logs.log import Log
@@ -131,14 +131,20 @@ class Trials:
     scans those end that were paid in part, "" of one that was not made.
     """
 
-    def __init__(self, work: float = UNLIMITED, progress: bool = False) -> None:
-        self.work, self.progress, self.left_out = work, progress, dict[str, str]()
+    def __init__(
+        self, work: float = UNLIMITED, progress: bool = False, detecting: Collection[Where] = frozenset()
+    ) -> None:
+        self.work, self.progress, self.detecting, self.left_out = work, progress, detecting, dict[str, str]()
 
     @classmethod
-    def of(cls, log: Log, brief: bool, progress: bool) -> Trials:
+    def of(cls, log: Log, brief: bool, progress: bool, detecting: Collection[Where] = frozenset()) -> Trials:
         """Return the trials of a verdict on the run of a log: `brief` at its end, else as it was asked for."""
-        work = max(BRIEF, SHARE * work_of(log.events))
-        return cls(work if brief else THOROUGH * work, progress)
+        work = max(BRIEF, SHARE * work_of(log.events, detecting))
+        return cls(work if brief else THOROUGH * work, progress, detecting)
+
+    def work_of(self, events: Iterable[Event]) -> int:
+        """Return the work of filtering events."""
+        return work_of(events, self.detecting)
 
     def pays(self, what: str, work: float) -> bool:
         """Return whether a search of so much work is in the budget; name it if it is not."""
@@ -167,7 +173,7 @@ class Trials:
 
         None of them if these have few scans.  The search is named with the number that it has.
         """
-        paid = share * self.work / max(filters * work_of(events) + PART * parts, 1.0)
+        paid = share * self.work / max(filters * self.work_of(events) + PART * parts, 1.0)
         if paid >= 1.0:
             return events
         scans = round(paid * sum(isinstance(event, Scan | Raw) for event in events))
@@ -182,7 +188,7 @@ class Trials:
         """
         end = (1.0 - RACED) * self.work
         none, *left = (Trial(self, log, events, change) for change in changes)
-        now, whole, before = UNUSED if none.run() is None else none.fit, work_of(events), 0.0
+        now, whole, before = UNUSED if none.run() is None else none.fit, self.work_of(events), 0.0
         left = left if _misfit(now) > SURELY else []
         for share in SHARES:
             most = max(1, int((self.work - end) / (whole * (share - before) + PART)))
@@ -197,18 +203,18 @@ class Trials:
         return [change._replace(gain=gain, since_s=events[0].t_s) for change, gain in made]
 
 
-def work_of(events: Iterable[Event]) -> int:
-    """Return the work of filtering events."""
-    return sum(map(_work, events))
+def work_of(events: Iterable[Event], detecting: Collection[Where] = frozenset()) -> int:
+    """Return the work of filtering events; sensors that are `detecting` find few landmarks in the rays of a scan."""
+    return sum(_work(event, detecting) for event in events)
 
 
-def _work(event: Event) -> int:
-    if isinstance(event, Scan):
+def _work(event: Event, detecting: Collection[Where]) -> int:
+    if isinstance(event, Scan) and (event.robot, event.sensor) not in detecting:
         easy = event.ids is not None and None not in event.ids and event.y.shape[1] > 1
         return (SCAN + OBSERVATION * len(event.y)) * (1 if easy else HARDER)
     if isinstance(event, Frame):
         return IMAGE
-    return (SCAN + OBSERVATION * DETECTED) * HARDER if isinstance(event, Raw) else CONTROL
+    return (SCAN + OBSERVATION * DETECTED) * HARDER if isinstance(event, Scan | Raw) else CONTROL
 
 
 class Trial:
@@ -245,7 +251,7 @@ class Trial:
     def _spend(self, event: Event, report: Report) -> None:
         if self.recorder is not None:
             parts = sum(len(of.parts.log_weights) for of in self.recorder.slam.state.sums.values())
-            self.trials.spend(_work(event) * (1 + parts))
+            self.trials.spend(self.trials.work_of([event]) * (1 + parts))
 
 
 def _in_race(none: Fit, fits: Sequence[Fit], rest: float) -> Ints:
@@ -295,10 +301,15 @@ def likelihood_gain(before: Fit, after: Fit, but: Ints | None = None) -> float:
     return float(second.sum() - first.sum()) - 0.5 * MOST * (len(first) - len(second))
 
 
+def detecting(run: Run) -> set[Where]:
+    """Return the sensors of a run whose landmarks are found by a detector."""
+    robots = run.final_slam().robots.values()
+    return {(r.name, name) for r in robots for name, m in r.sensors.items() if m.detector is not None}
+
+
 def first_events(run: Run, events: Iterable[Event], most: int = SCANS) -> list[Event]:
     """Return the first events, with so many scans and observations; in a raw scan are few, however many its beams."""
-    robots = run.final_slam().robots.values()
-    detected = {(r.name, name) for r in robots for name, m in r.sensors.items() if m.detector is not None}
+    detected = detecting(run)
     found, scans, observations = list[Event](), 0, 0
     for n, event in enumerate(events):
         found.append(event)

@@ -14,7 +14,7 @@ from kalmark.diagnosis.lost import unchecked_ends
 from kalmark.diagnosis.named_causes import COPIES, MISFIT, Cause, all_misfit, begin_s, cause_of_mistake
 from kalmark.diagnosis.single_ids import OUTLIERS
 from kalmark.diagnosis.structural_causes import readings_off, structural_causes
-from kalmark.diagnosis.trials import AT_ONCE, Trials, fit_of_run, is_configured
+from kalmark.diagnosis.trials import AT_ONCE, Trials, detecting, fit_of_run, is_configured
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.logs.log import Log
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst_status
@@ -44,7 +44,7 @@ def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bo
     """
     run.run_plugins()
     seen, log = blind(run)
-    trials = Trials.of(log, brief, progress)
+    trials = Trials.of(log, brief, progress, detecting(seen))
     found = _of_causes(seen, log, most, trials)
     if trials.left_out:
         found = _with_left_out(seen, found, trials)
@@ -65,8 +65,10 @@ def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:
     now, causes = fit_of_run(run), verdict.causes
     misfit = now.mean > MISFITS_ALL or misfits_from(now) is not None
     if verdict.map == OK and misfit and not all(trials.left_out.values()):
-        line = next(iter((*window_warnings(run), *all_misfit(run))), MISFITTING)
-        verdict = replace(verdict, map=DOUBTFUL, causes=(Cause(MISFIT, begin_s(run), 0.0, line), *causes))
+        if all(cause.harmless for cause in causes):
+            line = next(iter((*window_warnings(run), *all_misfit(run))), MISFITTING)
+            causes = (Cause(MISFIT, begin_s(run), 0.0, line), *causes)
+        verdict = replace(verdict, map=DOUBTFUL, causes=causes)
     return replace(verdict, left_out=tuple(what + since for what, since in trials.left_out.items()))
 
 
@@ -96,8 +98,8 @@ def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
         return cured
     status, off_m = shape_without(run, without.run)
     rest = judged(*without, structural_causes(*without, off), most, trials)
-    shift_m = max(rest.shift_m or 0.0, off_m)
-    return replace(rest, map=worst_status(status, rest.map), causes=(cause, *rest.causes), shift_m=shift_m)
+    causes = replace(cause, harmless=cause.name == OUTLIERS and status == OK), *rest.causes
+    return replace(rest, map=worst_status(status, rest.map), causes=causes, shift_m=max(rest.shift_m or 0.0, off_m))
 
 
 def _with_signs(run: Run, verdict: Verdict) -> Verdict:
