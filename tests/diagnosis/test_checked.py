@@ -70,7 +70,7 @@ def test_a_verdict_is_the_same_with_truth_without_and_with_a_wrong_one(
     wrong = {name: Trajectory(t.t_ns, np.add(t.poses, [50.0, 0.0, 0.0])) for name, t in log.truth.items()}
     elsewhere = replace(log, truth=wrong, landmarks={name: place + 50.0 for name, place in log.landmarks.items()})
     runs = [run_of(each) for each in (log, log.without_truth(), elsewhere)]
-    first, *others = [km.diagnose(run).as_dict() for run in runs]
+    first, *others = [km.diagnose(run, brief=True).as_dict() for run in runs]
     assert all(other == first for other in others)
     assert runs[0].summary["robots"] != runs[1].summary["robots"]  # figures of an evaluation are against the truth
 

@@ -46,7 +46,7 @@ def test_a_path_without_landmarks_is_judged_as_a_path(tmp_path: Path) -> None:
     run = run_of()
     summary = run.evaluate()
     assert summary["warnings"] == [] and summary["landmarks"] == 0
-    assert diagnose(run).map == "ok"
+    assert diagnose(run, brief=True).map == "ok"
     assert [*verdict_lines(run.summary["verdict"])] == [
         "the path is ok, by innovations alone, no batch solution: no sensor observes landmarks"
     ]
@@ -76,14 +76,14 @@ def test_readings_that_are_off_make_a_path_doubtful_and_say_why(
 def test_a_few_outliers_do_not_make_a_path_doubtful() -> None:
     run = run_of(outliers=5)
     assert np.sum(run.history.outcome == "rejected") == 5
-    assert diagnose(run).map == "ok"
+    assert diagnose(run, brief=True).map == "ok"
 
 
 def test_single_numbers_that_are_white_make_no_path_doubtful() -> None:
     """Of 40 windows of 60 pairs one has an autocorrelation of .56 by chance: of two numbers that would be none."""
     run = run_of(steps=2400, seed=2)
     assert max(w.value for w in autocorrelations(run.history)) > 0.5
-    assert diagnose(run).map == "ok"
+    assert diagnose(run, brief=True).map == "ok"
 
 
 def test_a_path_that_a_receiver_moved_to_and_fro_is_doubtful_and_says_so(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_a_path_that_a_receiver_moved_to_and_fro_is_doubtful_and_says_so(tmp_pat
         moved = [(each.robot, each.sensor) for each in one.history.placed]
         assert moved == [("rover", "receiver")] * 2
         assert any("of receiver that agree moved rover by 28, 28 m" in line for line in one.evaluate()["warnings"])
-    verdict = diagnose(run)
+    verdict = diagnose(run, brief=True)
     assert verdict.map == "doubtful"
     (cause,) = (c for c in verdict.causes if c.evidence.startswith("readings of receiver that agree moved rover by"))
     left_out = np.sum(run.history.outcome == "rejected")
