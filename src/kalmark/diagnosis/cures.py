@@ -47,7 +47,7 @@ class _Taken(NamedTuple):
     systematic: tuple[Run, Log]
 
     @property
-    def gain(self) -> float:
+    def total(self) -> float:
         """The log-likelihood that all of them gain."""
         return sum(one.gain for one in self.errors.values())
 
@@ -72,7 +72,7 @@ def with_cures(
         return verdict
     tried = chain(also, suspects, _of_less_certain_controls(part, part_log, most, trials))
     taken = _taken_out(part, part_log, verdict, tried, most, trials)
-    if not taken.errors or taken.gain < least:
+    if not taken.errors or taken.total < least:
         return verdict
     found = sorted(taken.errors.values(), key=lambda f: -f.gain)
     names, after = [f.name for f in found], taken.rest
@@ -118,7 +118,7 @@ def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], m
         systematic = taken.systematic if one.unit == TIMES else (without, changed)
         taken = _Taken(errors | {key: now}, without, changed, rest, systematic)
         names = [name for name, *_ in taken.errors]
-        tried = [f for f in _suspects(rest.search, 1) if f.name in names or f.gain > SHARE * taken.gain]
+        tried = [f for f in _suspects(rest.search, 1) if f.name in names or f.gain > SHARE * taken.total]
         if fit_of_run(without).mean > MISFITS_ALL:
             tried = chain(tried, _of_less_certain_controls(without, changed, most, trials))
     return taken
