@@ -12,7 +12,8 @@ import kalmark as km
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis import trials
 from kalmark.diagnosis.batch_verdict import judged
-from kalmark.diagnosis.cures import with_cures
+from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.cures import with_cures, without_error
 from kalmark.diagnosis.gross_mistakes import likeliest
 from kalmark.diagnosis.mistakes import late_scans
 from kalmark.diagnosis.trials import CONTROL, HARDER, OBSERVATION, PART, SCAN, THOROUGH, Trials, work_of
@@ -136,15 +137,29 @@ def test_an_error_whose_cure_is_not_paid_is_named_all_the_same(monkeypatch: pyte
     assert "cures of small errors" in verdict.left_out
 
 
-def test_cures_are_tried_on_the_first_part_of_a_log_that_the_budget_pays() -> None:
+def late_run() -> tuple[Run, Log]:
+    """Return the run of a log whose scans are stamped .15 s late, and that log."""
     run, log = run_of(False)
     events = [replace(e, t_ns=e.t_ns + 150_000_000) if isinstance(e, Scan) else e for e in log.events]
     late = replace(log, events=sorted(events, key=trials.sort_key))
     again = Trials().filter(run.config, late, late.events)
     assert again is not None
-    engine = Trials(20.0 * (work_of(late.events) + PART))
-    verdict = with_cures(again, late, judged(again, late, [], 3000, Trials()), True, 3000, engine)
-    assert engine.left_out["cures of small errors"].startswith(" after ")
+    return again, late
+
+
+def test_a_cure_is_tried_on_the_first_part_of_a_log_that_the_budget_pays() -> None:
+    again, late = late_run()
+    mistake = late_scans(again.config, "rover", -0.12)
+    finding = Finding(mistake.name, mistake.of, 0.0, 0.0, mistake.value, unit=mistake.unit)
+    gain, without, _, _ = without_error(again, late, finding, Trials())
+    part, *same = without_error(again, late, finding, Trials(0.6 * work_of(late.events)))
+    assert without is not again and gain > part > trials.SURELY
+    assert same == [again, late, finding]
+
+
+def test_late_scans_have_the_size_with_which_the_log_is_likeliest() -> None:
+    again, late = late_run()
+    verdict = with_cures(again, late, judged(again, late, [], 3000, Trials()), True, 3000, Trials())
     assert verdict.causes[0].name == "time_offset"
     (line,) = trials.options_of(verdict.causes[0].cure)
     assert float(line.partition("=")[2]) == pytest.approx(-0.15, abs=0.01)

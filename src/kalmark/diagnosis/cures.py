@@ -20,11 +20,11 @@ from kalmark.diagnosis.mistakes import LATE
 from kalmark.diagnosis.named_causes import cause_of
 from kalmark.diagnosis.onsets import without_onset
 from kalmark.diagnosis.structural_causes import structural_causes
-from kalmark.diagnosis.trials import AT_ONCE, FITS, SOLVED, Trials, fit_of_run, likelihood_gain, with_cure
+from kalmark.diagnosis.trials import AT_ONCE, FITS, Fit, Trials, fit_of_run, likelihood_gain, with_cure
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
-from kalmark.results.checked import OK, worst_status
+from kalmark.results.checked import DOUBTFUL, OK, worst_status
 from kalmark.results.run import Run
 
 CURES = "cures of small errors"
@@ -37,7 +37,8 @@ Cured = tuple[float, Run, Log, Finding | None]  # the gain of a cure, the run an
 class _Taken(NamedTuple):
     """Errors that are taken out of a log, by name, the run and log without them, and the verdict on that.
 
-    `systematic` is run and log without the systematic errors, the noise as it was stated.
+    `systematic` is run and log without the systematic errors, the noise as it was stated.  `partly`: the budget paid
+    for the last one in the first part of the log alone, and it is in run and log.
     """
 
     errors: dict[tuple[str, ...], Finding]
@@ -45,6 +46,7 @@ class _Taken(NamedTuple):
     log: Log
     rest: Verdict
     systematic: tuple[Run, Log]
+    partly: bool = False
 
     @property
     def total(self) -> float:
@@ -59,42 +61,24 @@ def with_cures(
     """Return a verdict in which the small errors with which the log is likeliest are taken out by their cures.
 
     That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
-    All together have to gain `least`.  They are tried on the first part of a log, where the budget does not pay for all
-    of it.
+    All together have to gain `least`.
     """
     suspects = _suspects(verdict.search, TRIED)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
     if not doubted and not any(f.name == LATE or f.begins for f in suspects):  # whose sizes are so far from linear
         return verdict
-    part, part_log = _paid_part(run, log, trials)
-    if part is None:
-        return verdict
-    tried = chain(also, suspects, _of_less_certain_controls(part, part_log, most, trials))
-    taken = _taken_out(part, part_log, verdict, tried, most, trials)
+    tried = chain(also, suspects, _of_less_certain_controls(run, log, most, trials))
+    taken = _taken_out(run, log, verdict, tried, most, trials)
     if not taken.errors or taken.total < least:
         return verdict
     found = sorted(taken.errors.values(), key=lambda f: -f.gain)
-    names, after = [f.name for f in found], taken.rest
-    if part is not run:  # the causes of all of the log, but for noise that the part has no more
-        noise = {f.name for f in steady_errors(verdict.search) if f.unit == TIMES} - {c.name for c in taken.rest.causes}
-        names, after = [*names, *noise], verdict
-    left = [c for c in after.causes if c.name not in names]
-    worst = {c.name for c in verdict.causes[:1]} if part is run else set()
+    left = [c for c in taken.rest.causes if c.name not in [f.name for f in found]]
+    worst = {c.name for c in verdict.causes[: 0 if taken.partly else 1]}
     before = [c for c in left if c.name in worst and not c.harmless][:1]  # is not explained
     causes = *before, *(cause_of(run, f, log) for f in found), *(c for c in left if c not in before)
-    return replace(verdict, map=worst_status(verdict.map, shape_without(part, taken.run)[0]), causes=causes)
-
-
-def _paid_part(run: Run, log: Log, trials: Trials) -> tuple[Run | None, Log]:
-    """Return the run of the first part of a log for which the budget pays the cures, all of it if it does, and that."""
-    work = trials.work_of(log.events)
-    filters = TRIED + SIZES + ROUNDS * (1.0 + SOLVED * len(run.history.d2) / work)
-    events = trials.payable(CURES, run, [*log.events], filters, TRIED + SIZES + ROUNDS)
-    if len(events) == len(log.events):
-        return run, log
-    part = replace(log, events=events)
-    return trials.filter(run.config, part, events) if events else None, part
+    status = worst_status(verdict.map, shape_without(run, taken.run)[0], DOUBTFUL if taken.partly else OK)
+    return replace(verdict, map=status, causes=causes)
 
 
 def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], most: int, trials: Trials) -> _Taken:
@@ -105,7 +89,8 @@ def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], m
     taken = _Taken({}, run, log, verdict, (run, log))
     for _ in range(ROUNDS):
         best, errors = _likeliest_cure(taken.run, taken.log, tried, trials), taken.errors
-        if best[3] is not None and best[3].unit != TIMES:
+        partly = best[1] is taken.run
+        if best[3] is not None and best[3].unit != TIMES and not partly:
             best = _of_likeliest_size(*taken.systematic, best[3], trials)
             errors = {key: one for key, one in errors.items() if one.unit != TIMES}
         gain, without, changed, one = best
@@ -114,6 +99,8 @@ def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], m
         key = one.name, *one.of, str(one.since_s)
         have = [errors[key]] if key in errors else []
         now = joined([*have, replace(one, gain=gain, noise=1.0, errors=1.0)])  # of other observations
+        if partly:
+            return taken._replace(errors=errors | {key: now}, partly=True)
         rest = judged(without, changed, structural_causes(without, changed, []), most, trials)
         systematic = taken.systematic if one.unit == TIMES else (without, changed)
         taken = _Taken(errors | {key: now}, without, changed, rest, systematic)
@@ -130,9 +117,9 @@ def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding], trials: Trials
     After one with which a log fits that did not, only other sizes of that error are tried.
     """
     best: Cured = 0.0, run, log, None
-    fitted, named, work = fit_of_run(run).mean < FITS, "", trials.work_of(log.events)
+    fitted, named = fit_of_run(run).mean < FITS, ""
     for finding in tried:
-        if named in ("", finding.name) and trials.pays(CURES, work):
+        if named in ("", finding.name):
             best = max(best, without_error(run, log, finding, trials), key=lambda of: of[0])
         if not fitted and best[3] is not None and fit_of_run(best[1]).mean < FITS:
             named = best[3].name
@@ -197,13 +184,23 @@ def own_cure(run: Run, finding: Finding) -> str:
 
 
 def without_error(run: Run, log: Log, finding: Finding, trials: Trials) -> Cured:
-    """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that."""
+    """Return by how much likelier the log of a run is with the cure of a finding, its run and log with it, and that.
+
+    Where the budget pays for the first part of the log alone, run and log are as they are.
+    """
     if finding.begins:
         changed = without_onset(run, log, finding)
         made = None if changed is None else (run.config, changed, list(changed.events))
     else:
         made = with_cure(run.config, log, own_cure(run, finding))
-    after = None if made is None else trials.filter(*made)
-    if made is None or after is None:
+    if made is None:
         return 0.0, run, log, finding
-    return likelihood_gain(fit_of_run(run), fit_of_run(after)), after, made[1], finding
+    config, changed, every = made
+    events = trials.payable(CURES, run, every, 1, 1)
+    after = trials.filter(config, changed, events) if events else None
+    if after is None:
+        return 0.0, run, log, finding
+    now, then = fit_of_run(run), fit_of_run(after)
+    if len(events) == len(every):
+        return likelihood_gain(now, then), after, changed, finding
+    return likelihood_gain(Fit(*(column[: len(then.values)] for column in now)), then), run, log, finding

@@ -76,7 +76,7 @@ def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
     """Return the verdict by what is found in the log: what explains most is taken out, and the rest is judged so."""
     off, explained = readings_off(run, log, trials)
     first = structural_causes(run, log, off)
-    alarmed = any(not cause.harmless for cause in first)
+    alarmed = any(not cause.harmless for cause in first) or bool(run.history.carried())
     found = None if explained else gross(run, log, trials, alarmed)
     if found is None:
         return with_cures(run, log, judged(run, log, first, most, trials), alarmed, most, trials)
