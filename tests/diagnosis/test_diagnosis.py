@@ -842,6 +842,7 @@ def test_an_error_of_controls_in_a_gap_of_them_is_no_cause() -> None:
     assert not _is_of_gap(run, replace(slip, since_s=3.0, until_s=7.0))
     assert not _is_of_gap(run, replace(slip, of=("b", "w_radps", "scale"), until_s=7.0))
     assert not _is_of_gap(run, replace(slip, W=np.zeros(1), until_s=7.0))  # of a sensor
+    assert not _is_of_gap(run, replace(slip, of=(), until_s=7.0))  # of all sensors
 
 
 def test_no_error_of_controls_adds_to_a_gap() -> None:
