@@ -91,7 +91,10 @@ def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], m
         best, errors = _likeliest_cure(taken.run, taken.log, tried, trials), taken.errors
         partly = best[1] is taken.run
         if best[3] is not None and best[3].unit != TIMES and not partly:
-            best = _of_likeliest_size(*taken.systematic, best[3], trials)
+            if taken.run is not taken.systematic[0]:
+                best = without_error(*taken.systematic, best[3], trials)
+                partly = best[1] is taken.systematic[0]
+            best = best if partly else _of_likeliest_size(*taken.systematic, best, trials)
             errors = {key: one for key, one in errors.items() if one.unit != TIMES}
         gain, without, changed, one = best
         if one is None or gain < LEAST_GAIN:
@@ -126,21 +129,22 @@ def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding], trials: Trials
     return best
 
 
-def _of_likeliest_size(run: Run, log: Log, finding: Finding, trials: Trials) -> Cured:
+def _of_likeliest_size(run: Run, log: Log, best: Cured, trials: Trials) -> Cured:
     """Return the cure of a systematic error, of late scans of the size with which the log of a run is likeliest.
 
     It is doubled as long as that gains; then a parabola through three sizes has the next one.
     """
-    best: Cured = 0.0, run, log, None
-    work, tried, size = trials.work_of(log.events), {0.0: 0.0}, finding.value
-    while (
-        len(tried) < (SIZES if finding.name == LATE else 2)
-        and min(abs(size - one) for one in tried) >= SAME * abs(size)
-        and trials.pays(CURES, work)
-    ):
+    gain, _, _, finding = best
+    if finding is None or finding.name != LATE:
+        return best
+    work, tried = trials.work_of(log.events), {0.0: 0.0, finding.value: gain}
+    while len(tried) < SIZES and trials.pays(CURES, work):
+        size = _next_size(tried)
+        if min(abs(size - one) for one in tried) < SAME * abs(size):
+            break
         again = without_error(run, log, replace(finding, value=size), trials)
         tried[size] = again[0]
-        best, size = max(best, again, key=lambda of: of[0]), _next_size(tried)
+        best = max(best, again, key=lambda of: of[0])
     return best
 
 
