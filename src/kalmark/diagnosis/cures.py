@@ -89,12 +89,13 @@ def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], m
     taken = _Taken({}, run, log, verdict, (run, log))
     for _ in range(ROUNDS):
         best, errors = _likeliest_cure(taken.run, taken.log, tried, trials), taken.errors
-        partly = best[1] is taken.run
-        if best[3] is not None and best[3].unit != TIMES and not partly:
+        partly, finding = best[1] is taken.run, best[3]
+        if finding is not None and finding.unit != TIMES and not partly:
             if taken.run is not taken.systematic[0]:
-                best = without_error(*taken.systematic, best[3], trials)
+                best = without_error(*taken.systematic, finding, trials)
                 partly = best[1] is taken.systematic[0]
-            best = best if partly else _of_likeliest_size(*taken.systematic, best, trials)
+            if finding.name == LATE and not partly:
+                best = _of_likeliest_size(*taken.systematic, finding, best, trials)
             errors = {key: one for key, one in errors.items() if one.unit != TIMES}
         gain, without, changed, one = best
         if one is None or gain < LEAST_GAIN:
@@ -129,15 +130,12 @@ def _likeliest_cure(run: Run, log: Log, tried: Iterable[Finding], trials: Trials
     return best
 
 
-def _of_likeliest_size(run: Run, log: Log, best: Cured, trials: Trials) -> Cured:
-    """Return the cure of a systematic error, of late scans of the size with which the log of a run is likeliest.
+def _of_likeliest_size(run: Run, log: Log, finding: Finding, best: Cured, trials: Trials) -> Cured:
+    """Return the cure of an error, `best` with the size that was found, of the size with which the log is likeliest.
 
     It is doubled as long as that gains; then a parabola through three sizes has the next one.
     """
-    gain, _, _, finding = best
-    if finding is None or finding.name != LATE:
-        return best
-    work, tried = trials.work_of(log.events), {0.0: 0.0, finding.value: gain}
+    work, tried = trials.work_of(log.events), {0.0: 0.0, finding.value: best[0]}
     while len(tried) < SIZES and trials.pays(CURES, work):
         size = _next_size(tried)
         if min(abs(size - one) for one in tried) < SAME * abs(size):
