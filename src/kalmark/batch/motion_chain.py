@@ -26,13 +26,14 @@ Starts = Mapping[str, tuple[Array, Array]]
 ANYWHERE = 1e3  # m and rad, sigmas of a motion that is not known at all
 ZERO = 1e-14  # of a covariance's largest eigenvalue
 OTHER, START, UNKNOWN = "", "start", "unknown"  # errors that are of no component of a control
+TURNING = "turns"  # of a robot on wheels, of which no component of a control is one
 
 
 class Systematic(NamedTuple):
     """An error of a robot's controls that stays: its `kind`, the column it is of, its unit.
 
     An "offset" is added to the column; of increments it is the part gathered in a second.  A "scale" is the share of
-    the column itself, "per_way" what is added for each metre.
+    the column itself, or of all `TURNING` of a robot on wheels; "per_way" is what is added for each metre.
     """
 
     robot: str
@@ -48,7 +49,14 @@ def systematic_errors(robot: str, motion: Motion) -> list[Systematic]:
     rates = units if motion.held else [f"{unit}/s" for unit in units]
     found = [Systematic(robot, column, "offset", unit) for column, unit in zip(columns, rates, strict=True)]
     found += [Systematic(robot, column, "scale", "") for column in columns]
-    return found + [Systematic(robot, columns[j], "per_way", "rad/m") for j in _turns(columns)]
+    found += [Systematic(robot, columns[j], "per_way", "rad/m") for j in _turns(columns)]
+    return found + [Systematic(robot, TURNING, "scale", "")] * _on_wheels(motion)
+
+
+def _on_wheels(motion: Motion) -> bool:
+    """Return whether the controls are rotations of wheels in the plane: no ways, and no turns of the robot."""
+    columns = tuple(motion.columns)
+    return 1 < len(columns) == len(_turns(columns)) and motion.space.axes == 1
 
 
 def _turns(columns: tuple[str, ...]) -> list[int]:
@@ -77,7 +85,7 @@ class Course:
         self.node, self.moves, self.known = node, 0, True
         space = self.motion.space
         self.moved, self.Q = ORIGIN[space.size], np.zeros((len(self.columns) + 2, space.dof, space.dof))
-        self.T = np.zeros((space.dof, 2 * len(self.columns) + len(self.turns)))
+        self.T = np.zeros((space.dof, 2 * len(self.columns) + len(self.turns) + _on_wheels(self.motion)))
         self.shared: dict[int, Array] = {}
 
     def forget(self) -> None:
@@ -88,10 +96,12 @@ class Course:
 
     def add(self, part: MotionPart, roots: list[Array]) -> None:
         """Move by one part.  The error of a control that scans split is kept out of Q, with a root of N in `roots`."""
-        self.moves += 1
-        self.moved, F, R_u = self.motion.move(self.moved, self._control(part), part.dt_s)
+        self.moves, before = self.moves + 1, self.moved
+        self.moved, F, R_u = self.motion.move(before, self._control(part), part.dt_s)
         self.Q = F @ self.Q @ F.T
         self._stay(part, F, R_u)
+        if _on_wheels(self.motion):
+            self.T[-1, -1] += math.remainder(self.moved[-1] - before[-1], 2.0 * math.pi)
         self.shared = {key: F @ S for key, S in self.shared.items()}
         if part.N is not self.N:
             self.N, self.root = part.N, root(part.N)
@@ -124,7 +134,7 @@ class Course:
         T[:, k : 2 * k] += R_u * part.u
         if self.turns:
             way = part.u[self.lengths]
-            T[:, 2 * k :] += R_u[:, self.turns] * math.sqrt(way @ way)
+            T[:, 2 * k : 2 * k + len(self.turns)] += R_u[:, self.turns] * math.sqrt(way @ way)
 
 
 class Node(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
-from kalmark.diagnosis.error_columns import Where, columns_of, errors_of_all_sensors, rates_of
+from kalmark.diagnosis.error_columns import Where, columns_of, errors_together, rates_of
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.onsets import find_onsets
 from kalmark.logs.progress import track
@@ -165,7 +165,7 @@ class Search:
         """Return all that may explain what is left."""
         columns = columns_of(self.linear, self.sensors, self.rates)
         found = [
-            *causes.systematic(self.linear, [*columns, *errors_of_all_sensors(columns)]),
+            *causes.systematic(self.linear, [*columns, *errors_together(columns)]),
             *causes.noise(self.linear, self.simulated, self.sensors),
             *causes.outliers(self.linear, self.t_s),
             *causes.moving_landmarks(self.linear, self.t_s),

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from kalmark.batch.motion_chain import TURNING
 from kalmark.diagnosis.causes import TIMES, Finding
-from kalmark.diagnosis.error_columns import ALL
+from kalmark.diagnosis.error_columns import ALL, ALSO
 from kalmark.diagnosis.jumps import LISTED, OddControl, step_size
 from kalmark.results.figure_texts import figure
 from kalmark.slam.gaps import MARGIN
@@ -150,7 +151,8 @@ def _how(finding: Finding) -> str:
 
 def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, cures = finding.of[0], []
-    for sensor in (_current(config, robot, "sensors") or {}) if finding.of[1] == ALL else finding.of[1:2]:
+    sensors = (_current(config, robot, "sensors") or {}) if finding.of[1] == ALL else finding.of[1:2]
+    for sensor in () if "azimuth_rad" in finding.of else sensors:
         theta = _current(config, robot, "sensors", sensor, "mount", "theta_rad") or 0.0
         cures.append(_set(robot, f"sensors.{sensor}.mount.theta_rad", theta - finding.value))
     return f"bearings of {_sensor(finding)} are off by {_value(finding)} ({_sure(finding)})", " ".join(cures)
@@ -176,10 +178,19 @@ def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
     small = "small" if finding.value > 0 else "large"
     each = " for each metre driven" if kind == "per_way" else ""
     size = _size(abs(finding.value), finding.unit.removesuffix("/m") if each else finding.unit)
-    evidence = f"{column} of {robot} is {size} too {small}{each} ({_sure(finding)})"
-    key = CALIBRATIONS.get((column, kind))
-    cure = _set(robot, f"motion.{key}", abs(finding.value)) if key else f"correct {column} by {_value(finding)}{each}"
-    return evidence, cure
+    verb = "are" if ALSO in column or column == TURNING else "is"
+    evidence = f"{column} of {robot} {verb} {size} too {small}{each} ({_sure(finding)})"
+    key, by = CALIBRATIONS.get((column, kind)), 1.0 / (1.0 - finding.value)
+    if key:
+        return evidence, _set(robot, f"motion.{key}", abs(finding.value))
+    if column == TURNING:
+        keys = [key for key in ("track_m", "wheelbase_m") if _current(config, robot, "motion", key)]
+        sizes = [_current(config, robot, "motion", key) * (1.0 - finding.value) for key in keys]
+        return evidence, " ".join(_set(robot, f"motion.{key}", m) for key, m in zip(keys, sizes, strict=True))
+    if kind == "scale":
+        names = column.split(ALSO)
+        return evidence, " ".join(log_correction_line(config, "factors", (robot, name), by) for name in names)
+    return evidence, f"correct {column} by {_value(finding)}{each}"
 
 
 def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:

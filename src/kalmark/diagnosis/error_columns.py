@@ -10,6 +10,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.batch.batch_state import POSES, BatchState, Ints
+from kalmark.batch.motion_chain import TURNING
 from kalmark.batch.problem import Factor
 from kalmark.diagnosis.linear import Linear
 from kalmark.geometry.angles import rotation
@@ -20,6 +21,7 @@ MOST_SCALE = 0.25  # beyond it the problem is not linear: of a scale, and of a m
 SLOW_S = 1e-3  # least time between two poses
 LENGTHS = ("range", "distance")  # how columns of lengths begin
 ALL = "all sensors"
+ALSO = " and "  # between the columns of wheels that have an error together
 SHARED = ("range_scale", "range_offset", "bearing_offset", "time_offset")  # errors of several sensors
 
 Where = tuple[str, str]
@@ -58,16 +60,24 @@ def stacked(columns: list[Column]) -> tuple[Array, Array]:
     return np.stack([c.Z for c in columns], axis=1), np.stack([c.W for c in columns], axis=1)
 
 
-def errors_of_all_sensors(columns: list[Column]) -> list[Column]:
-    """Return the errors that all sensors of a robot may share, where it has several: one laser, one clock."""
+def errors_together(columns: list[Column]) -> list[Column]:
+    """Return the errors that all sensors of a robot may share, where it has several: one laser, one clock.
+
+    And the scale of all its wheels: one of a single wheel is a turn.
+    """
     found: dict[tuple[str, str], list[Column]] = {}
     for column in (c for c in columns if c.name in SHARED):
         found.setdefault((column.name, column.of[0]), []).append(column)
-    return [
+    together = [
         Column(name, (robot, ALL, *dict.fromkeys(x for c in same for x in c.of[2:])), same[0].unit,
                sum((c.Z for c in same), start=np.zeros_like(same[0].Z)), same[0].W, same[0].most)
         for (name, robot), same in found.items() if len(same) > 1
     ]  # fmt: skip
+    for robot in [c.of[0] for c in columns if c.of[1:] == (TURNING, "scale")]:
+        wheels = [c for c in columns if c.of[::2] == (robot, "scale") and c.of[1] != TURNING]
+        of, W = (robot, ALSO.join(c.of[1] for c in wheels), "scale"), np.sum([c.W for c in wheels], axis=0)
+        together.append(Column("odometry_scale", of, "", wheels[0].Z, W, MOST_SCALE))
+    return together
 
 
 def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: Array) -> list[Column]:
@@ -123,7 +133,8 @@ def _of_its_columns(
             yield "range_scale", of, "", MOST_SCALE, longer * mine
             yield "range_offset", of, "m", math.inf, one * mine
         elif name.endswith("_rad"):
-            offset = "bearing_offset" if name == "normal_rad" else f"{name.removesuffix('_rad')}_offset"
+            turned = name.startswith(("normal", "azimuth"))
+            offset = "bearing_offset" if turned else f"{name.removesuffix('_rad')}_offset"
             yield offset, of, "rad", math.inf, one * mine
         elif longer[:, c].any() and not longer[:, :c].any():  # one scale of all columns
             scaled = [other for k, other in enumerate(names) if longer[:, k].any()]
@@ -157,13 +168,18 @@ def _of_controls(linear: Linear) -> Iterator[Column]:
     motions, nothing = linear.problem.motions, np.zeros(len(linear.at.z))
     e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds)
     for k, error in sorted(enumerate(motions.errors), key=lambda one: one[1].kind != "scale"):
-        turns = error.column.endswith(("_rad", "_radps"))
+        turns = error.column.endswith(("_rad", "_radps", TURNING))
         name = "odometry_turn" if turns else "odometry_scale" if error.kind == "scale" else "odometry_offset"
         if error.column == "steering_rad":
             name = "steering_offset"
         W = motions.systematic[:, k]
         if error.kind == "scale":
-            W = W + linear.root @ np.where(kinds == f"{error.robot}.{error.column}", e, 0.0)
+            of_turns = error.column == TURNING
+            mine = (
+                np.char.startswith(kinds, f"{error.robot}.") if of_turns else kinds == f"{error.robot}.{error.column}"
+            )
+            added = (linear.root @ np.where(mine, e, 0.0)).reshape(-1, linear.state.spaces[POSES].dof)
+            W = W + (added * ([0.0, 0.0, 1.0] if of_turns else 1.0)).ravel()
         most = math.inf if error.unit else MOST_SCALE
         yield Column(name, (error.robot, error.column, error.kind), error.unit, nothing, W, most)
 

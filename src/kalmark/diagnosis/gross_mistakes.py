@@ -80,11 +80,11 @@ def likeliest(run: Run, log: Log, trials: Trials, first: int | None = None) -> M
     exchanged.  None, too, if the log is likelier where what is far off is left out: no mistake is then why it is.
     """
     config, rest = (run.config, log) if first is None else log_from(run, log, first)
-    events = first_events(run, rest.events)
+    beginning = first_events(run, rest.events)
     none, off = Mistake("", "", "", config), Mistake(OUTLIERS, "", "", gated(config))
-    changes = [none, off, *changes_of(run, config, events)]
+    changes = [none, off, *changes_of(run, config, beginning)]
     filters, parts = RACE + SHARES[0] * len(changes), 2 * len(changes)
-    events = trials.payable(MISTAKES, run, events, filters, parts, share=RACED)
+    events = trials.payable(MISTAKES, run, beginning, filters, parts, share=RACED)
     if not events:
         return None
     made = trials.race(rest, events, changes)
@@ -94,7 +94,7 @@ def likeliest(run: Run, log: Log, trials: Trials, first: int | None = None) -> M
     found = first_of([one for one in made if not one.of or one is sizes[one.name, one.of]])
     if found is None or first is None:
         return found
-    every = next(one for one in changes_of(run, run.config, events) if found.evidence.startswith(one.evidence))
+    every = next(one for one in changes_of(run, run.config, beginning) if found.evidence.startswith(one.evidence))
     before = [e for e in log.events if e.t_ns < events[0].t_ns]
     paid = trials.pays(f"{MISTAKES} before t={found.since_s:.1f} s", 2.0 * trials.work_of(before))
     both = (trials.fit_with(log, before, one) for one in (none._replace(config=run.config), every))

@@ -14,6 +14,7 @@ from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Control
 from kalmark.logs.log import Log
 from kalmark.results.run import Run
+from kalmark.slam.held_readings import SELDOM
 
 SHARE = 0.1  # of a stream that are copies
 PAIRS = 0.9  # of the copies that stand alone: neither the one before nor the one after is a copy
@@ -66,7 +67,7 @@ def repeated_scans(run: Run) -> Flags:
 def copies(run: Run, log: Log) -> list[Copies]:
     """Return the streams of a log with copies: scans of sensors, and controls."""
     h, slam = run.history, run.final_slam()
-    given = {key: one for key, one in slam.state.given.items() if one.repeats >= max(LEAST, SHARE * one.number)}
+    given = {key: one for key, one in slam.state.given.items() if one.repeats >= max(LEAST, SELDOM * one.number)}
     found = [Copies(*key, one.repeats, one.number, one.since_ns * 1e-9, True) for key, one in given.items()]
     same, robot = repeated_scans(run), run.history.robot[run.history.step]
     for key in sorted({*zip(robot[same].tolist(), h.sensor[same].tolist(), strict=True)}):

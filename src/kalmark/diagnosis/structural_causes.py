@@ -18,7 +18,7 @@ from kalmark.diagnosis.gross_mistakes import started_at
 from kalmark.diagnosis.jumps import LISTED
 from kalmark.diagnosis.lost import find_lost_robots
 from kalmark.diagnosis.named_causes import COPIES, JUMP, MISFIT, Cause, begin_s, cause_of_mistake, controls_of
-from kalmark.diagnosis.single_ids import MISPLACED, MOVED
+from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
 from kalmark.diagnosis.state_readings import SIGMA, fit_of_readings, reasons
 from kalmark.diagnosis.trials import FITS, LOST, MOST, Trials, fit_of_run
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
@@ -180,6 +180,24 @@ def _copied(run: Run, log: Log) -> list[Cause]:
         evidence += "the log has them twice"
         harmless = not sensor and run.final_slam().robots[robot].motion.held  # the same velocity goes on
         found.append(Cause(COPIES, since_s, float(number), evidence, "leave out every second of them", harmless))
+    return found
+
+
+def unfitting_measurements(run: Run) -> list[Cause]:
+    """Return the sensors, and fixes, of which more fitted nothing than by chance; without ids nothing was seen again.
+
+    They do no harm.
+    """
+    h, found = run.history, []
+    alone = (h.outcome == "tentative") & ~np.isin(h.landmark, h.landmark[h.fused])
+    of = [f"observations of {a}.{b}" for a, b in zip(h.robot[h.step], h.sensor, strict=True)]
+    stream = np.array([*of, *(f"fixes of {fix.robot}" for fix in h.fixes)])
+    out = np.array([*(alone | (h.outcome == "rejected")), *(not fix.used for fix in h.fixes)], dtype=np.bool_)
+    for name in np.unique(stream):
+        number, left_out = int((stream == name).sum()), int(out[stream == name].sum())
+        if pdtrc(left_out - 1, FEW * number) < LIKELY:
+            evidence = f"{left_out} of {number} {name} fit nothing in the map, and were left out"
+            found.append(Cause(OUTLIERS, begin_s(run), 0.5 * MOST * left_out, evidence, "", True))
     return found
 
 

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 from kalmark.diagnosis.batch_verdict import Verdict, judged
 from kalmark.diagnosis.blind import blind
-from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.causes import MOST_OUTLIERS, Finding
 from kalmark.diagnosis.cures import CURES, own_cure, steady_errors, with_cures
 from kalmark.diagnosis.effect import Effect, shape_without
 from kalmark.diagnosis.gross_mistakes import gross, misfits_from
 from kalmark.diagnosis.lost import unchecked_ends
 from kalmark.diagnosis.named_causes import COPIES, MISFIT, Cause, all_misfit, begin_s, cause_of_mistake
 from kalmark.diagnosis.single_ids import OUTLIERS
-from kalmark.diagnosis.structural_causes import readings_off, structural_causes
-from kalmark.diagnosis.trials import AT_ONCE, Trials, detecting, fit_of_run, is_configured
+from kalmark.diagnosis.structural_causes import readings_off, structural_causes, unfitting_measurements
+from kalmark.diagnosis.trials import AT_ONCE, FITS, Trials, detecting, fit_of_run, is_configured
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.logs.log import Log
 from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, worst_status
@@ -49,7 +49,7 @@ def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bo
     if trials.left_out:
         found = _with_left_out(seen, found, trials)
     causes = [replace(cause, cure="") if is_configured(run.config, cause.cure) else cause for cause in found.causes]
-    verdict = _with_signs(seen, replace(found, causes=tuple(causes)))
+    verdict = _with_outliers(seen, _with_signs(seen, replace(found, causes=tuple(causes))))
     if not run.summary:
         run.evaluate()
     summary = run.summary
@@ -58,6 +58,20 @@ def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bo
     if first not in ("noise", MISFIT, UNCHECKED) and not first.endswith(("_sigma", "_noise")):
         summary["warnings"] = [w.replace(TOO_SMALL, f"see {first} in the verdict") for w in summary["warnings"]]
     return verdict
+
+
+def _with_outliers(run: Run, verdict: Verdict) -> Verdict:
+    """Return a verdict in which observations that fit nothing are a cause, if no other one explains them.
+
+    Where all others fit, they explain a misfit.  Causes that do no harm are the last.
+    """
+    causes, fused, fine = verdict.causes, run.history.fused, verdict.map == OK
+    if all(cause.harmless or cause.name == MISFIT for cause in causes):
+        alone = fused.mean() > 1.0 - MOST_OUTLIERS and fit_of_run(run).values[fused].mean() < FITS
+        found = unfitting_measurements(run) if fine or alone else []
+        kept = [cause for cause in causes if not found or cause.name not in (MISFIT, OUTLIERS)]
+        causes = *(replace(cause, harmless=fine) for cause in found), *kept
+    return replace(verdict, causes=tuple(sorted(causes, key=lambda cause: cause.harmless)))
 
 
 def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:

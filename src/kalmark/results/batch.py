@@ -145,7 +145,8 @@ def batch_input(run: Recording, known: Known | None = None, rows: Index | None =
     again_begun = [change for change in history.changes if change.reason == BEGUN_AGAIN]
     for change in again_begun:
         placed &= (history.landmark != change.landmark) | (history.step > change.step)
-    fused = np.flatnonzero(placed)
+    gone = {change.landmark for change in history.changes if change.reason == ELSEWHERE} - {*ids}  # not mapped again
+    fused = np.flatnonzero(placed & ~np.isin(history.landmark, [*gone]))
     rows = _of_places(history, slam, fused if rows is None else rows)
     fused = _of_places(history, slam, fused)
     names = {row: ids.get(name, as_id(name)) for row, name in zip(fused, _in_the_end(history, fused), strict=True)}
