@@ -64,8 +64,9 @@ def gross(run: Run, log: Log, trials: Trials, alarmed: bool = False) -> tuple[Mi
     explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
     first = None if explained else misfits_from(now)
     fits = now.mean < MISFIT and not run.stopped and first is None
-    alone = None if fits and not alarmed else likeliest(run, log, trials, first)
-    if alone is not None and of_ids is not None and first is None:  # found in the first events, compared in all
+    about = misfits_from(now, 0.0) if first is None else first
+    alone = None if fits and not alarmed else likeliest(run, log, trials, about)
+    if alone is not None and of_ids is not None and about is None:  # found in the first events, compared in all
         paid = trials.pays(f"{alone.name}, compared with {of_ids[0].name}", trials.work_of(log.events))
         alone = alone._replace(gain=likelihood_gain(now, trials.fit_with(log, log.events, alone)) if paid else 0.0)
     if alone is None or (of_ids is not None and alone.gain < of_ids[0].gain):
@@ -120,8 +121,11 @@ def late_or_early(config: Mapping[str, Any], events: list[Event], robot: str) ->
         yield from (late_scans(config, robot, k * max(control_s, 0.5 * scan_s)) for k in STEPS)
 
 
-def misfits_from(now: Fit) -> int | None:
-    """Return the observation from which on a run does not fit any more, that fitted before; None if there is none."""
+def misfits_from(now: Fit, least: float = MISFIT) -> int | None:
+    """Return the observation from which on a run does not fit any more, that fitted before; None if there is none.
+
+    From there on it fits no better than `least`, mean d2 per degree of freedom.
+    """
     values = now.values
     if len(values) < 4 * WINDOW:
         return None
@@ -129,7 +133,7 @@ def misfits_from(now: Fit) -> int | None:
     first = int(np.argmax(bad)) + WINDOW if bad.any() else 0
     if not WINDOW < first < len(values) - WINDOW or values[: first - WINDOW].mean() > FITS:
         return None
-    return first if values[first:].mean() > MISFIT else None
+    return first if values[first:].mean() > least else None
 
 
 def find_wrong_starts(run: Run, log: Log, trials: Trials) -> Mistake | None:
