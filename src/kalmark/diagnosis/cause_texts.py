@@ -180,17 +180,20 @@ def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
     size = _size(abs(finding.value), finding.unit.removesuffix("/m") if each else finding.unit)
     verb = "are" if ALSO in column or column == TURNING else "is"
     evidence = f"{column} of {robot} {verb} {size} too {small}{each} ({_sure(finding)})"
-    key, by = CALIBRATIONS.get((column, kind)), 1.0 / (1.0 - finding.value)
+    return evidence, _calibrated(finding, config) or f"correct {column} by {_value(finding)}{each}"
+
+
+def _calibrated(finding: Finding, config: Mapping[str, Any]) -> str:
+    """Return the lines that take an error of controls out of a configuration or log, "" if no key does."""
+    robot, column, kind = finding.of
+    key = CALIBRATIONS.get((column, kind))
     if key:
-        return evidence, _set(robot, f"motion.{key}", abs(finding.value))
+        return _set(robot, f"motion.{key}", abs(finding.value))
     if column == TURNING:
-        keys = [key for key in ("track_m", "wheelbase_m") if _current(config, robot, "motion", key)]
-        sizes = [_current(config, robot, "motion", key) * (1.0 - finding.value) for key in keys]
-        return evidence, " ".join(_set(robot, f"motion.{key}", m) for key, m in zip(keys, sizes, strict=True))
-    if kind == "scale":
-        names = column.split(ALSO)
-        return evidence, " ".join(log_correction_line(config, "factors", (robot, name), by) for name in names)
-    return evidence, f"correct {column} by {_value(finding)}{each}"
+        now = {key: _current(config, robot, "motion", key) for key in ("track_m", "wheelbase_m")}
+        return " ".join(_set(robot, f"motion.{key}", m * (1.0 - finding.value)) for key, m in now.items() if m)
+    by, wheels = 1.0 / (1.0 - finding.value), column.split(ALSO) if kind == "scale" else ()
+    return " ".join(log_correction_line(config, "factors", (robot, wheel), by) for wheel in wheels)
 
 
 def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:

@@ -65,19 +65,22 @@ def errors_together(columns: list[Column]) -> list[Column]:
 
     And the scale of all its wheels: one of a single wheel is a turn.
     """
-    found: dict[tuple[str, str], list[Column]] = {}
-    for column in (c for c in columns if c.name in SHARED):
-        found.setdefault((column.name, column.of[0]), []).append(column)
-    together = [
-        Column(name, (robot, ALL, *dict.fromkeys(x for c in same for x in c.of[2:])), same[0].unit,
-               sum((c.Z for c in same), start=np.zeros_like(same[0].Z)), same[0].W, same[0].most)
-        for (name, robot), same in found.items() if len(same) > 1
-    ]  # fmt: skip
-    for robot in [c.of[0] for c in columns if c.of[1:] == (TURNING, "scale")]:
-        wheels = [c for c in columns if c.of[::2] == (robot, "scale") and c.of[1] != TURNING]
-        of, W = (robot, ALSO.join(c.of[1] for c in wheels), "scale"), np.sum([c.W for c in wheels], axis=0)
-        together.append(Column("odometry_scale", of, "", wheels[0].Z, W, MOST_SCALE))
-    return together
+    on_wheels, found = {c.of[0] for c in columns if c.of[1] == TURNING}, dict[tuple[str, str], list[Column]]()
+    for column in columns:
+        robot, second, *kind = column.of
+        if column.name in SHARED:
+            found.setdefault((column.name, robot), []).append(column)
+        elif robot in on_wheels and kind == ["scale"] and second != TURNING:
+            found.setdefault(("odometry_scale", robot), []).append(column)
+    return [_sum(name, same) for (name, _), same in found.items() if len(same) > 1]
+
+
+def _sum(name: str, same: list[Column]) -> Column:
+    """Return the error of a name that several sensors, or wheels, have together."""
+    (robot, *_), kinds = same[0].of, dict.fromkeys(x for c in same for x in c.of[2:])
+    of = ALL if name in SHARED else ALSO.join(c.of[1] for c in same)
+    Z, W = (column.sum(axis=1) for column in stacked(same))
+    return Column(name, (robot, of, *kinds), same[0].unit, Z, W, same[0].most)
 
 
 def _of_sensors(linear: Linear, sensors: Mapping[Where, tuple[str, ...]], rates: Array) -> list[Column]:

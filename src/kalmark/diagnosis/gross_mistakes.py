@@ -64,7 +64,7 @@ def gross(run: Run, log: Log, trials: Trials, alarmed: bool = False) -> tuple[Mi
     explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
     first = None if explained else misfits_from(now)
     fits = now.mean < MISFIT and not run.stopped and first is None
-    about = misfits_from(now, 0.0) if first is None else first
+    about = misfits_from(now, 0.0)
     alone = None if fits and not alarmed else likeliest(run, log, trials, about)
     if alone is not None and of_ids is not None and about is None:  # found in the first events, compared in all
         paid = trials.pays(f"{alone.name}, compared with {of_ids[0].name}", trials.work_of(log.events))
