@@ -12,7 +12,7 @@ from kalmark.diagnosis.effect import Effect, shape_without
 from kalmark.diagnosis.gross_mistakes import gross, misfits_from
 from kalmark.diagnosis.lost import unchecked_ends
 from kalmark.diagnosis.named_causes import COPIES, MISFIT, Cause, all_misfit, begin_s, cause_of_mistake
-from kalmark.diagnosis.single_ids import MISPLACED, OUTLIERS
+from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
 from kalmark.diagnosis.structural_causes import readings_off, structural_causes, unfitting_measurements
 from kalmark.diagnosis.trials import AT_ONCE, FITS, Trials, detecting, fit_of_run, is_configured
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
@@ -23,6 +23,7 @@ from kalmark.results.warnings import TOO_SMALL, signs, window_warnings
 
 __all__ = ["Cause", "Effect", "Verdict", "diagnose"]
 AGAIN = "the log filtered again without the mistake"  # what a verdict was made of
+OF_OUTLIERS = OUTLIERS, MISPLACED, MOVED  # causes that observations which fit nothing explain, if they do no harm
 MISFITTING = "from some time on the observations do not fit"
 
 
@@ -63,16 +64,15 @@ def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bo
 def _with_outliers(run: Run, verdict: Verdict) -> Verdict:
     """Return a verdict in which observations that fit nothing are a cause, if no other one explains them.
 
-    Where all others fit, they explain a misfit, and landmarks that one began.  Causes that do no harm are the last.
+    Where all others fit, they explain a misfit, and landmarks that began with one.  Harmless causes are the last.
     """
     causes, fused, fine = verdict.causes, run.history.fused, verdict.map == OK
-    if all(cause.harmless or cause.name == MISFIT for cause in causes):
+    if all(cause.name == MISFIT or (cause.harmless and cause.name in OF_OUTLIERS) for cause in causes):
         alone = fused.mean() > 1.0 - MOST_OUTLIERS and fit_of_run(run).values[fused].mean() < FITS
         found = unfitting_measurements(run) if fine or alone else []
         kept = [cause for cause in causes if not found or cause.name not in (MISFIT, OUTLIERS)]
-        causes = *kept, *(replace(cause, harmless=fine) for cause in found)
-    order = sorted(causes, key=lambda cause: (cause.harmless, cause.name == MISPLACED))
-    return replace(verdict, causes=tuple(order))
+        causes = *(replace(cause, harmless=fine) for cause in found), *kept
+    return replace(verdict, causes=tuple(sorted(causes, key=lambda cause: cause.harmless)))
 
 
 def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:
