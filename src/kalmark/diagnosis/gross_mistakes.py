@@ -105,16 +105,16 @@ def likeliest(run: Run, log: Log, trials: Trials, first: int | None = None) -> M
 
 
 def changes_of(run: Run, config: Mapping[str, Any], events: list[Event]) -> list[Mistake]:
-    """Return the mistakes that events may have, without ids those of time, too: else the residuals show these."""
-    late = run.history.robots if (run.history.id == "").any() else ()
+    """Return the mistakes that events may have, those of time, too, where the residuals do not show these.
+
+    Without ids, or of a robot that was elsewhere, the scans that show it most are of no landmark.
+    """
+    late = run.history.robots if (run.history.id == "").any() or run.history.carried() else ()
     return [*mistakes(config, run), *(one for robot in late for one in late_or_early(config, events, robot))]
 
 
 def late_or_early(config: Mapping[str, Any], events: list[Event], robot: str) -> Iterator[Mistake]:
-    """Yield that the scans of a robot are late or early, by multiples of the time of a control or of half a scan.
-
-    Where ids are unknown, the scans that show it most are of no landmark, and no residual is left of them.
-    """
+    """Yield that the scans of a robot are late or early, by multiples of the time of a control or of half a scan."""
     mine = [[e.t_ns for e in events if isinstance(e, kind) and e.robot == robot] for kind in (Control, Scan)]
     if min(map(len, mine)) >= LEAST_SCANS:
         control_s, scan_s = (float(np.median(np.diff(t_ns))) * 1e-9 for t_ns in mine)

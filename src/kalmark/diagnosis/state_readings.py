@@ -22,6 +22,7 @@ from kalmark.diagnosis.trials import (
     FITS,
     MISFIT,
     MOST,
+    RACED,
     Fit,
     Trials,
     first_events,
@@ -288,7 +289,7 @@ def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], Filtered
         return [], None
     config, found, number = dict(run.config), list[Mistake](), CHANGES * len(fit_of_readings(run).tried())
     events = first_events(run, log, SCANS)
-    events = engine.payable(READINGS, run, events, number, number)
+    events = engine.payable(READINGS, run, events, number, number, share=RACED)
     now = filtered_with(engine, config, log, events) if events else None
     while now is not None and len(found) < MOST_CAUSES and (not found or _is_paid(engine, now, number, events)):
         of = [_Sensor(engine, now, config, log, events, where) for where in now.tried()]
