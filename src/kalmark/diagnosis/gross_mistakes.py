@@ -63,8 +63,7 @@ def gross(run: Run, log: Log, trials: Trials, alarmed: bool = False) -> tuple[Mi
     of_ids = find_wrong_ids(run, log, now, trials)
     explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
     first = None if explained else misfits_from(now)
-    fits = now.mean < MISFIT and not run.stopped and first is None
-    about = misfits_from(now, 0.0)
+    fits, about = now.mean < MISFIT and not run.stopped and first is None, first_misfit(run)
     alone = None if fits and not alarmed else likeliest(run, log, trials, about)
     if alone is not None and of_ids is not None and about is None:  # found in the first events, compared in all
         paid = trials.pays(f"{alone.name}, compared with {of_ids[0].name}", trials.work_of(log.events))
@@ -105,20 +104,28 @@ def likeliest(run: Run, log: Log, trials: Trials, first: int | None = None) -> M
 
 
 def changes_of(run: Run, config: Mapping[str, Any], events: list[Event]) -> list[Mistake]:
-    """Return the mistakes that events may have, those of time, too, where the residuals do not show these.
-
-    Without ids, or of a robot that was elsewhere, the scans that show it most are of no landmark.
-    """
-    late = run.history.robots if (run.history.id == "").any() or run.history.carried() else ()
+    """Return the mistakes that events may have, without ids those of time, too: else the residuals show these."""
+    late = run.history.robots if (run.history.id == "").any() else ()
     return [*mistakes(config, run), *(one for robot in late for one in late_or_early(config, events, robot))]
 
 
 def late_or_early(config: Mapping[str, Any], events: list[Event], robot: str) -> Iterator[Mistake]:
-    """Yield that the scans of a robot are late or early, by multiples of the time of a control or of half a scan."""
+    """Yield that the scans of a robot are late or early, by multiples of the time of a control or of half a scan.
+
+    Where ids are unknown, the scans that show it most are of no landmark, and no residual is left of them.
+    """
     mine = [[e.t_ns for e in events if isinstance(e, kind) and e.robot == robot] for kind in (Control, Scan)]
     if min(map(len, mine)) >= LEAST_SCANS:
         control_s, scan_s = (float(np.median(np.diff(t_ns))) * 1e-9 for t_ns in mine)
         yield from (late_scans(config, robot, k * max(control_s, 0.5 * scan_s)) for k in STEPS)
+
+
+def first_misfit(run: Run) -> int | None:
+    """Return the first observation about which a run does not fit, that fitted before; in space, that never fits again.
+
+    In the plane robots begin there where they were (`log_from`).
+    """
+    return misfits_from(fit_of_run(run), MISFIT if run.history.in_space else 0.0)
 
 
 def misfits_from(now: Fit, least: float = MISFIT) -> int | None:

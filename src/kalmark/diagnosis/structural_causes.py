@@ -202,20 +202,22 @@ def unfitting_measurements(run: Run) -> list[Cause]:
 
 
 def abandoned_surveys(run: Run) -> list[Cause]:
-    """Return the surveyed landmarks that the filter found elsewhere and mapped again, which does no harm."""
+    """Return the surveyed landmarks that the filter found elsewhere, and maps again where it can: that does no harm."""
     h, found, now = run.history, [], {str(id_): k for k, id_ in enumerate(run.landmarks.ids)}
     surveys = {prior.landmark: prior for prior in h.priors}
-    for change in (c for c in h.changes if c.reason == ELSEWHERE and c.landmark in surveys and c.landmark in now):
-        prior, k, d = surveys[change.landmark], now[change.landmark], h.d
-        mean, P = run.landmarks.means[k][:d], run.landmarks.covariances[k][:d, :d] + prior.covariance[:d, :d]
-        off, at = mean - prior.mean[:d], ", ".join(figure(float(x)) for x in mean)
-        chi2 = float(off @ np.linalg.pinv(P) @ off)
-        evidence = (
-            f"landmark {change.landmark} is {figure(float(np.linalg.norm(off)))} m from its survey"
-            f" ({figure(float(np.sqrt(chi2)), 2)} sigma): the filter left its survey out and mapped it at ({at}) m"
-        )
+    for change in (c for c in h.changes if c.reason == ELSEWHERE and c.landmark in surveys):
+        prior, d, told = surveys[change.landmark], h.d, "does not fit its survey: the filter left its survey out"
+        chi2 = MOST * float(((h.id == change.landmark) & (h.outcome == "rejected")).sum())
+        if change.landmark in now:
+            k = now[change.landmark]
+            mean, P = run.landmarks.means[k][:d], run.landmarks.covariances[k][:d, :d] + prior.covariance[:d, :d]
+            off, at = mean - prior.mean[:d], ", ".join(figure(float(x)) for x in mean)
+            chi2 = float(off @ np.linalg.pinv(P) @ off)
+            sure = f"{figure(float(np.linalg.norm(off)))} m from its survey ({figure(float(np.sqrt(chi2)), 2)} sigma)"
+            told = f"is {sure}: the filter left its survey out and mapped it at ({at}) m"
+        evidence, since_s = f"landmark {change.landmark} {told}", float(h.t_ns[change.step]) * 1e-9
         cure = f"correct {change.landmark} in the file of the survey, or leave it out"
-        found.append(Cause("landmark_prior", float(h.t_ns[change.step]) * 1e-9, 0.5 * chi2, evidence, cure, True))
+        found.append(Cause("landmark_prior", since_s, 0.5 * chi2, evidence, cure, True))
     return found
 
 

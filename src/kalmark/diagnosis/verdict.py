@@ -9,7 +9,7 @@ from kalmark.diagnosis.blind import blind
 from kalmark.diagnosis.causes import MOST_OUTLIERS, Finding
 from kalmark.diagnosis.cures import CURES, own_cure, steady_errors, with_cures
 from kalmark.diagnosis.effect import Effect, shape_without
-from kalmark.diagnosis.gross_mistakes import gross, likeliest, misfits_from
+from kalmark.diagnosis.gross_mistakes import first_misfit, gross, likeliest, misfits_from
 from kalmark.diagnosis.lost import unchecked_ends
 from kalmark.diagnosis.named_causes import COPIES, MISFIT, Cause, all_misfit, begin_s, cause_of_mistake
 from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
@@ -96,7 +96,7 @@ def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
     if found is None:
         verdict = judged(run, log, first, most, trials)
         noisy = any(cause.name.endswith("_sigma") and not cause.harmless for cause in verdict.causes)
-        alone = likeliest(run, log, trials, misfits_from(fit_of_run(run), 0.0)) if noisy and not alarmed else None
+        alone = likeliest(run, log, trials, first_misfit(run)) if noisy and not alarmed else None
         if alone is None:
             return with_cures(run, log, verdict, alarmed, most, trials)
         found = alone, None
