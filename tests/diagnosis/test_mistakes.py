@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -195,3 +196,23 @@ def test_without_ids_a_filter_that_makes_new_landmarks_all_the_time_does_not_fit
 
 def replace_ids(e: Event) -> Event:
     return Scan(t_ns=e.t_ns, robot=e.robot, sensor=e.sensor, y=e.y) if isinstance(e, Scan) else e
+
+
+def test_robots_with_the_same_sensors_may_make_a_mistake_alike() -> None:
+    robots = {
+        name: km.Robot(name, km.motion.Unicycle(), sensors={"laser": km.Mount(km.sensors.RangeBearing())})
+        for name in ("a", "b")
+    }
+    run: Any = SimpleNamespace(final_slam=lambda: SimpleNamespace(robots=robots))
+    made = [*mistakes({"robots": {"a": {}, "b": {}}}, run)]
+    turned = next(
+        one for one in made if one.name == "mount" and "a.laser" in one.evidence and "b.laser" in one.evidence
+    )
+    assert {turned.config["robots"][of]["sensors"]["laser"]["mount"]["theta_rad"] for of in "ab"} == {np.pi}
+    assert turned.cure.count("--set") == 2
+    flipped = next(
+        one for one in made if one.name == "control_sign" and "of a " in one.evidence and "of b " in one.evidence
+    )
+    assert flipped.change is not None
+    controls = [km.Control(t_s=0.0, robot=name, u=(1.0, 0.5)) for name in ("a", "b", "c")]
+    assert [flipped.change(e).u[1] for e in controls] == [-0.5, -0.5, 0.5]

@@ -75,7 +75,7 @@ class Course:
         self.robot, self.drive = robot, HeldInput(robot.motion, robot.watch())
         self.bias = bias
         self.held = -1  # which of the split controls is in force
-        self.turns = _turns(self.columns)
+        self.turns, self.on_wheels = _turns(self.columns), _on_wheels(robot.motion)
         self.lengths = [j for j in range(len(self.columns)) if j not in self.turns]
         self.N, self.root = np.zeros(0), np.zeros(0)  # of the last control
         self.reset(node)
@@ -85,7 +85,7 @@ class Course:
         self.node, self.moves, self.known = node, 0, True
         space = self.motion.space
         self.moved, self.Q = ORIGIN[space.size], np.zeros((len(self.columns) + 2, space.dof, space.dof))
-        self.T = np.zeros((space.dof, 2 * len(self.columns) + len(self.turns) + _on_wheels(self.motion)))
+        self.T = np.zeros((space.dof, 2 * len(self.columns) + len(self.turns) + self.on_wheels))
         self.shared: dict[int, Array] = {}
 
     def forget(self) -> None:
@@ -99,9 +99,7 @@ class Course:
         self.moves, before = self.moves + 1, self.moved
         self.moved, F, R_u = self.motion.move(before, self._control(part), part.dt_s)
         self.Q = F @ self.Q @ F.T
-        self._stay(part, F, R_u)
-        if _on_wheels(self.motion):
-            self.T[-1, -1] += math.remainder(self.moved[-1] - before[-1], 2.0 * math.pi)
+        self._stay(part, F, R_u, float(self.moved[-1] - before[-1]))
         self.shared = {key: F @ S for key, S in self.shared.items()}
         if part.N is not self.N:
             self.N, self.root = part.N, root(part.N)
@@ -124,8 +122,8 @@ class Course:
             return part.u
         return true_control(self.motion, part.u, self.bias, part.dt_s)[0]
 
-    def _stay(self, part: MotionPart, F: Array, R_u: Array) -> None:
-        """Carry the systematic errors on, in the order of `systematic_errors`."""
+    def _stay(self, part: MotionPart, F: Array, R_u: Array, turned: float) -> None:
+        """Carry the systematic errors on, in the order of `systematic_errors`; the part `turned` the robot, rad."""
         k, T = len(part.u), F @ self.T
         self.T = T
         if part.unknown is not None:  # in a gap no control was measured
@@ -135,6 +133,8 @@ class Course:
         if self.turns:
             way = part.u[self.lengths]
             T[:, 2 * k : 2 * k + len(self.turns)] += R_u[:, self.turns] * math.sqrt(way @ way)
+        if self.on_wheels:
+            T[-1, -1] += math.remainder(turned, 2.0 * math.pi)
 
 
 class Node(NamedTuple):

@@ -94,7 +94,8 @@ def likeliest(run: Run, log: Log, trials: Trials, first: int | None = None) -> M
     found = first_of([one for one in made if not one.of or one is sizes[one.name, one.of]])
     if found is None or first is None:
         return found
-    every = next(one for one in changes_of(run, run.config, beginning) if found.evidence.startswith(one.evidence))
+    same = (one for one in changes_of(run, run.config, beginning) if found.evidence.startswith(one.evidence))
+    every = max(same, key=lambda one: len(one.evidence))  # of all robots alike, it begins as that of the first one
     before = [e for e in log.events if e.t_ns < events[0].t_ns]
     paid = trials.pays(f"{MISTAKES} before t={found.since_s:.1f} s", 2.0 * trials.work_of(before))
     both = (trials.fit_with(log, before, one) for one in (none._replace(config=run.config), every))

@@ -34,6 +34,7 @@ LATE = "time_offset"
 OPTICAL = {"roll_deg": -90.0, "yaw_deg": -90.0}  # from the axes of a robot to those of a camera
 
 Change = Callable[[Event], Event]
+OfOne = Callable[[Mapping[str, Any], Robot], Iterator["Mistake"]]  # the mistakes of a robot
 Where = tuple[str, str]  # robot and sensor
 
 
@@ -70,15 +71,35 @@ def mistakes(config: Mapping[str, Any], run: Run) -> Iterator[Mistake]:
     plain = {of: names for of, names in columns.items() if robots[of[0]].sensors[of[1]].detector is None}
     for sensors in _groups(plain):
         yield from _of_columns(config, sensors)
+    yield from _of_robots(config, [*robots.values()], _of_mounts)
     for robot in robots.values():
-        yield from _of_mounts(config, robot)
         yield from _of_ranges(config, robot)
-    for robot in robots.values():
-        yield from _of_controls(config, robot)
+    yield from _of_robots(config, [*robots.values()], _of_controls)
     if any(column.endswith("ps") for robot in robots.values() for column in robot.motion.columns):
         for unit, factor in TIMES.items():
             cure = log_correction_line(config, "factors", ("t_s",), factor)
             yield Mistake("units", f"times fit only if they are {unit}", cure, config, _at(factor))
+
+
+def _of_robots(config: Mapping[str, Any], robots: list[Robot], of_one: OfOne) -> Iterator[Mistake]:
+    """Yield the mistakes of each robot, and those that all make alike, if they have the same sensors and controls."""
+    for robot in robots:
+        yield from of_one(config, robot)
+    first, *others = robots
+    kinds = {(*r.motion.columns, *((name, *m.sensor.columns) for name, m in r.sensors.items())) for r in robots}
+    for k, one in enumerate(of_one(config, first) if others and len(kinds) == 1 else ()):
+        alike = one
+        for robot in others:
+            alike = _both(alike, [*of_one(alike.config, robot)][k])
+        yield alike
+
+
+def _both(first: Mistake, second: Mistake) -> Mistake:
+    """Return two mistakes as one; the configuration of the second is without both."""
+    evidence, cure = f"{first.evidence}; {second.evidence}", f"{first.cure} {second.cure}"
+    one, other = first.change, second.change
+    change = (lambda e: other(one(e))) if one and other else None
+    return second._replace(evidence=evidence, cure=cure, change=change)
 
 
 def _groups(columns: Mapping[Where, tuple[str, ...]]) -> Iterator[dict[Where, tuple[str, ...]]]:
