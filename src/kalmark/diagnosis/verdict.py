@@ -23,7 +23,7 @@ from kalmark.results.warnings import TOO_SMALL, signs, window_warnings
 
 __all__ = ["Cause", "Effect", "Verdict", "diagnose"]
 AGAIN = "the log filtered again without the mistake"  # what a verdict was made of
-OF_OUTLIERS = OUTLIERS, MISPLACED, MOVED  # causes that observations which fit nothing explain, if they do no harm
+OF_OUTLIERS = MISFIT, OUTLIERS, MISPLACED, MOVED  # causes that observations which fit nothing explain
 MISFITTING = "from some time on the observations do not fit"
 
 
@@ -67,8 +67,8 @@ def _with_outliers(run: Run, verdict: Verdict) -> Verdict:
     Where all others fit, they explain a misfit, and landmarks that began with one.  Harmless causes are the last.
     """
     causes, fused, fine = verdict.causes, run.history.fused, verdict.map == OK
-    if all(cause.name == MISFIT or (cause.harmless and cause.name in OF_OUTLIERS) for cause in causes):
-        alone = fused.mean() > 1.0 - MOST_OUTLIERS and fit_of_run(run).values[fused].mean() < FITS
+    if all(cause.name in OF_OUTLIERS and (cause.harmless or not cause.score) for cause in causes):
+        alone = fused.sum() > (1.0 - MOST_OUTLIERS) * len(fused) and fit_of_run(run).values[fused].mean() < FITS
         found = unfitting_measurements(run) if fine or alone else []
         kept = [cause for cause in causes if not found or cause.name not in (MISFIT, OUTLIERS)]
         causes = *(replace(cause, harmless=fine) for cause in found), *kept
