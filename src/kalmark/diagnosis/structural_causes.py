@@ -215,9 +215,9 @@ def abandoned_surveys(run: Run) -> list[Cause]:
             chi2 = float(off @ np.linalg.pinv(P) @ off)
             sure = f"{figure(float(np.linalg.norm(off)))} m from its survey ({figure(float(np.sqrt(chi2)), 2)} sigma)"
             told = f"is {sure}: the filter left its survey out and mapped it at ({at}) m"
-        evidence, since_s = f"landmark {change.landmark} {told}", float(h.t_ns[change.step]) * 1e-9
+        since_s = float(h.t_ns[change.step]) * 1e-9
         cure = f"correct {change.landmark} in the file of the survey, or leave it out"
-        found.append(Cause("landmark_prior", since_s, 0.5 * chi2, evidence, cure, True))
+        found.append(Cause("landmark_prior", since_s, 0.5 * chi2, f"landmark {change.landmark} {told}", cure, True))
     return found
 
 

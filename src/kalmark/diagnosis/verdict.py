@@ -68,7 +68,7 @@ def _with_outliers(run: Run, verdict: Verdict) -> Verdict:
     """
     causes, fused, fine = verdict.causes, run.history.fused, verdict.map == OK
     if all(cause.name in OF_OUTLIERS and (cause.harmless or not cause.score) for cause in causes):
-        alone = fused.sum() > (1.0 - MOST_OUTLIERS) * len(fused) and fit_of_run(run).values[fused].mean() < FITS
+        alone = (~fused).sum() < MOST_OUTLIERS * len(fused) and fit_of_run(run).values[fused].mean() < FITS
         found = unfitting_measurements(run) if fine or alone else []
         kept = [cause for cause in causes if not found or cause.name not in (MISFIT, OUTLIERS)]
         causes = *(replace(cause, harmless=fine) for cause in found), *kept
