@@ -123,7 +123,10 @@ class Course:
         return true_control(self.motion, part.u, self.bias, part.dt_s)[0]
 
     def _stay(self, part: MotionPart, F: Array, R_u: Array, turned: float) -> None:
-        """Carry the systematic errors on, in the order of `systematic_errors`; the part `turned` the robot, rad."""
+        """Carry the systematic errors on, in the order of `systematic_errors`; the part `turned` the robot, rad.
+
+        The scale of the turns acts as if a part turned at its end: that is exact for short parts.
+        """
         k, T = len(part.u), F @ self.T
         self.T = T
         if part.unknown is not None:  # in a gap no control was measured

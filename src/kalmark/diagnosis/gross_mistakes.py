@@ -63,7 +63,8 @@ def gross(run: Run, log: Log, trials: Trials, alarmed: bool = False) -> tuple[Mi
     of_ids = find_wrong_ids(run, log, now, trials)
     explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
     first = None if explained else misfits_from(now)
-    fits, about = now.mean < MISFIT and not run.stopped and first is None, first_misfit(run)
+    fits = now.mean < MISFIT and not run.stopped and first is None
+    about = first_misfit(run)
     alone = None if fits and not alarmed else likeliest(run, log, trials, about)
     if alone is not None and of_ids is not None and about is None:  # found in the first events, compared in all
         paid = trials.pays(f"{alone.name}, compared with {of_ids[0].name}", trials.work_of(log.events))
