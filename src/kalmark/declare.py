@@ -21,7 +21,7 @@ from functools import cache
 from importlib import util
 from numbers import Integral, Real
 from pathlib import Path
-from types import ModuleType, NoneType, UnionType
+from types import FunctionType, ModuleType, NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -241,7 +241,7 @@ def unit_of(name: str) -> str:
 
 
 def parameters(model: Any) -> tuple[Parameter, ...]:
-    """Return the parameters of a model's class, () if it is no dataclass, or of a function.
+    """Return the parameters of a model's class: its fields, or those of its constructor; or of a function.
 
     >>> [one.name for one in parameters(km.sensors.Bearing)][:2]
     ['sigma_bearing_rad', 'range_min_m']
@@ -256,9 +256,16 @@ def _parameters(model: Any) -> tuple[Parameter, ...]:
     if dataclasses.is_dataclass(model):
         named = [field for field in dataclasses.fields(model) if field.init]
         named.sort(key=lambda field: bool(field.kw_only))
-    elif not isinstance(model, type):
+    elif not isinstance(model, type) or has_constructor(model):
         named = [*inspect.signature(model).parameters.values()]
     return tuple(_parameter(each.name, each.default, hints.get(each.name, Any)) for each in named)
+
+
+def has_constructor(model: type) -> bool:
+    """Return whether a class has a constructor that somebody wrote: it is no dataclass, and is not made one."""
+    first = next(each for each in model.__mro__ if "__init__" in vars(each))
+    made = vars(first)["__init__"]
+    return isinstance(made, FunctionType) and made.__module__ != "typing" and not dataclasses.is_dataclass(first)
 
 
 def declared_options(of: Any) -> tuple[Parameter, ...]:
@@ -358,7 +365,7 @@ def declared(model: Class) -> Class:
     >>> Budget(count=5)
     Budget(count=5)
     """
-    if "__dataclass_params__" in vars(model):  # a user's, made one in another way
+    if "__dataclass_params__" in vars(model) or has_constructor(model):  # a user's, made in another way
         return model
     after = next((vars(each)["__post_init__"] for each in model.__mro__ if "__post_init__" in vars(each)), None)
     if after not in _CHECKS:
@@ -436,6 +443,11 @@ def classes(role: str, world: str = "") -> dict[str, list[type]]:
     fitting = {name: classes_of(role, name, world) for name in _CLASSES.get(role, {})}
     found = [(name, models) for name, models in fitting.items() if models]
     return dict(sorted(found, key=lambda each: world_of_class(each[1][0]) == "space"))
+
+
+def roles() -> list[str]:
+    """Return the roles that have models."""
+    return [*_CLASSES]
 
 
 def built_in(role: str) -> tuple[Any, ...]:
@@ -546,7 +558,8 @@ def class_of_file(name: str) -> type | None:
 
 def place_of_object(value: Any) -> tuple[Path, str] | None:
     """Return the user's file that has a class or another object, and the name it has there; None if none has it."""
-    homes = ((_file_of(module, ".py"), module) for module in [*sys.modules.values()])
+    modules = [sys.modules.get(getattr(value, "__module__", "")), *sys.modules.values()]  # first the one it is made in
+    homes = ((_file_of(module, ".py"), module) for module in modules)
     named = ((file, home, name) for file, home in homes if file for name, own in vars(home).items() if own is value)
     return next(((file, name) for file, home, name in named if home.__name__.partition(".")[0] != "kalmark"), None)
 

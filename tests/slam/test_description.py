@@ -20,7 +20,16 @@ import kalmark as km
 from kalmark.cli import main
 from kalmark.config import build_slam, load_config, open_run
 from kalmark.config.sections import Choice, model_of
-from kalmark.declare import Parameter, built_in, class_of, declared_options, parameters, world_of_class
+from kalmark.declare import (
+    Parameter,
+    built_in,
+    class_of,
+    declared_options,
+    missing_models,
+    parameters,
+    roles,
+    world_of_class,
+)
 from kalmark.errors import ConfigError, KalmarkError, MapError, ModelError
 from kalmark.geometry.rotations import from_euler
 from kalmark.geometry.spaces import ROTATION
@@ -31,10 +40,8 @@ from kalmark.slam.description import describe, describe_model
 from kalmark.slam.saving import members_of
 from kalmark.slam.state import Settings
 
-ROLES = (
-    *("motion", "sensor", "landmark", "association", "estimator"),
-    *("detector", "initialization", "attention", "upkeep", "classes"),
-)
+missing_models()  # of all plug-ins, whatever was imported before
+ROLES = [role for role in roles() if role not in ("picture", "topic")]  # which are of a simulator and of a converter
 WORLDS: dict[str, tuple[Any, Any]] = {
     "plane": (km.motion.Unicycle(), (0, 0, 0)),
     "space": (km.motion.Odometry3D(), (0, 0, 0, 0, 0, 0, 1)),
@@ -82,7 +89,7 @@ def candidates(option: Parameter) -> Iterator[Any]:
     if option.role:
         fitting = Choice(option.role, "plane", type(SENSORS[0]) if option.role == "detector" else None)
         kinds = [class_of(option.role, name, "plane") for name in fitting.names()]
-        yield from (changed(kind, own.name) for kind in kinds for own in parameters(kind)[:1])
+        yield from (changed(kind, own.name) for kind in kinds for own in parameters(kind))
     else:
         yield from values(option)
 
@@ -359,6 +366,45 @@ def test_a_run_notes_a_sensor_that_its_configuration_cannot_have(sensor: Any, na
     slam = km.Slam([km.Robot("r", km.motion.Unicycle(), sensors={name: km.Mount(sensor)})])
     run = km.record(slam, [km.Control(t_s=0.0, robot="r", u=(0.5, 0.1))], progress=False)
     assert run.notes[1:] and run.notes[1].startswith(f"config.yaml cannot have {lacking}")
+
+
+CONSTRUCTORS = """
+class Own:
+    def __init__(self, limit=3.0):
+        self.limit = limit
+
+    def threshold(self, dof, default):
+        return self.limit**2
+
+    def associate(self, query):
+        return [(i, "") for i in query.ids]
+
+class Hidden(Own):
+    def __init__(self, gate=3.0):
+        super().__init__(gate)
+"""
+
+
+def test_a_plain_class_of_a_file_is_made_again_with_its_arguments_or_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_classes.py").write_text(CONSTRUCTORS)
+    monkeypatch.syspath_prepend(tmp_path)
+    mine: Any = import_module("my_classes")
+    write_log(tmp_path / "log", {"r": ["s"]}, {"s": ("range_m", "bearing_rad")})
+    robot = km.Robot("r", km.motion.Unicycle(), sensors={"s": km.Mount(SENSORS[0])})
+    runs = []
+    for association in (mine.Own(2.0), mine.Hidden(2.0)):
+        log = km.open_log(tmp_path / "log")
+        runs.append(km.record(km.Slam(robot, association=association), log, progress=False, pictures=False))
+    runs[0].save(tmp_path / "run")
+    again, log = run_again(tmp_path / "run")
+    assert type(again.association) is mine.Own and again.association.limit == 2.0
+    assert_same_state(km.record(again, log, progress=False, pictures=False).slam, runs[0].slam)
+    assert runs[0].notes == []
+    lacks = "config.yaml cannot have gate of my_classes.py:Hidden: `kalmark run` requires an attribute of that name"
+    assert runs[1].notes == [lacks]
+    del sys.modules["my_classes"]
 
 
 @pytest.mark.parametrize("value", [0.0, None])

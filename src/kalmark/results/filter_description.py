@@ -11,7 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.config.tree import EACH
-from kalmark.declare import declared_options, is_own, own_name, place_of_object, plugin_of, registered_name
+from kalmark.declare import declared_options, is_own, own_name, parameters, place_of_object, plugin_of, registered_name
 from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
@@ -41,7 +41,7 @@ def configuration(slam: Slam, log: Log) -> dict[str, Any]:
 
     Before the first event of the Slam it has what was added to its map.
     """
-    files, of_log = {file for _, file in _own(slam)}, dict[str, Any]()
+    files, of_log = {file for _, file, _ in _own(slam)}, dict[str, Any]()
     if log.path is not None:
         of_log = {"path": str(log.path.resolve()), "format": log.format, "robots": list(log.robots)} | log.options
         files |= {plugin_of(entry.read)} if (entry := known_formats().get(log.format)) else set()
@@ -58,16 +58,22 @@ def not_described(slam: Slam, log: Log) -> Iterator[str]:
         yield "config.yaml has no log, because this one has no file: `kalmark run` of it requires --log"
     if slam.t_ns is not None:
         yield "config.yaml lacks the events that the filter had before this log: `kalmark run` makes another map"
-    for kind, file in _own(slam):
+    for kind, file, lost in _own(slam):
         if file is None and not (is_own(kind) and registered_name(kind)):
             what = "a registered class, or an object, of a file"
             yield f"config.yaml cannot have {own_name(kind)}: `kalmark run` requires {what}"
+        elif lost:
+            what = "an attribute of that name"
+            yield f"config.yaml cannot have {lost[0]} of {own_name(kind)}: `kalmark run` requires {what}"
     if EACH in {*slam.robots}.union(*mounts_of(slam.robots)):
         yield f"config.yaml cannot have a robot or a sensor called {EACH}, which stands for all of them there"
 
 
-def _own(slam: Slam) -> list[tuple[Any, Path | None]]:
-    """Return the classes, or functions, of the models of a Slam, with the users' files that have them or the models."""
+def _own(slam: Slam) -> list[tuple[Any, Path | None, tuple[str, ...]]]:
+    """Return the classes, or functions, of the models of a Slam, with the users' files that have them or the models.
+
+    The texts are parameters of which nobody can read what they are.
+    """
     mounts = mounts_of(slam.robots).values()
     parts = (slam.state.settings, *slam.robots.values(), *mounts)
     models = [vars(part)[own.name] for part in parts for own in declared_options(type(part))]
@@ -77,12 +83,15 @@ def _own(slam: Slam) -> list[tuple[Any, Path | None]]:
     return [*dict.fromkeys(map(_home, models))]
 
 
-def _home(model: Any) -> tuple[Any, Path | None]:
+def _home(model: Any) -> tuple[Any, Path | None, tuple[str, ...]]:
     kind: Any = model if isinstance(model, FunctionType) else type(model)
+    lost = tuple(own.name for own in parameters(type(model)) if own.name not in vars(model))
     if registered_name(kind):
-        return kind, plugin_of(kind)
-    place = place_of_object(model) or place_of_object(kind)
-    return kind, place and place[0]
+        return kind, plugin_of(kind), lost
+    if place := place_of_object(model):
+        return kind, place[0], ()
+    place = place_of_object(kind)
+    return kind, place and place[0], lost
 
 
 @runtime_checkable

@@ -125,7 +125,7 @@ def describe_model(value: Any) -> Description:
     if registered_name(kind) is None and (place := place_of_object(value)):
         return {"type": f"{place[0].name}:{place[1]}"}
     name = registered_name(kind) or own_name(kind)
-    given = {own.name: plain_value(vars(value)[own.name]) for own in parameters(type(value))}
+    given = {own.name: plain_value(vars(value)[own.name]) for own in parameters(type(value)) if own.name in vars(value)}
     return given if has_one_model(name) else {"type": name} | given
 
 
