@@ -35,7 +35,8 @@ Models of your own, registered in a Python file by `kalmark.register`, are types
 among the `plugins`: a path beside the configuration.  **This runs the code of that file**, each time the configuration
 is read: name only files that you trust.  A class without a name is named by its file, `mine:Class`,
 and so is an object, such as a sensor of `km.pointwise`: `mine:sonar`.
-The keys of a class that is no dataclass are the arguments of its constructor; a run keeps those that it stores under their names.
+The keys of a class that is no dataclass are the arguments of its constructor; a run keeps those that it stores
+under their names.
 A section that is a `type` alone may be written as that: `estimator: ekf`.
 The `config.yaml` that a run leaves in its folder holds everything that was in force, and can be run again;
 its title is then the folder's name.  The notes of a run recorded in Python state

@@ -16,9 +16,11 @@ from kalmark.events import Event, Id, label_of_event
 from kalmark.filter.estimators import Correction, Estimator, Initializing, Selective, Update
 from kalmark.filter.map import Map, StochasticMap
 from kalmark.filter.maps import MOST, CostBalance, compress_map, new_map
+from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.protocols import Landmark, OfState, measures_blocks, world_of
+from kalmark.models.sensors import Gps2D, Gps3D
 from kalmark.slam.checks import check_covariance, fault_of, instance, refuse_odd_association, require_methods
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
@@ -83,10 +85,11 @@ class State:
     """The map, the tracks and the clones of some robots, with the channels and readers of their sensors.
 
     `inner` are the names of blocks that are neither robot nor landmark; `may_grow`: a dense map may be compressed;
-    `standing` are, of robots with detection of rest, the names of the sensors that do; `pose_hypotheses` are, of robots
-    whose readings do not fit, the other explanations of these; `sums` are, of robots that may be in several places,
-    their poses; `evidence` is that robots are elsewhere; `taken` are the events of this very time: the kind, the robot
-    and the sensor of each; `given` is what each sensor gave last; `balance` decides whether a dense map is compressed.
+    `standing` are, of robots with detection of rest, the names of the sensors that do; `antennas` are the readers of
+    fixes; `pose_hypotheses` are, of robots whose readings do not fit, the other explanations of these; `sums` are, of
+    robots that may be in several places, their poses; `evidence` is that robots are elsewhere; `taken` are the events
+    of this very time: the kind, the robot and the sensor of each; `given` is what each sensor gave last; `balance`
+    decides whether a dense map is compressed.
     Raises ModelError if robots, sensors and landmarks do not fit together.
     """
 
@@ -113,6 +116,7 @@ class State:
         self.evidence = {}
         self.moving, self.sources, self.readers = {}, {}, {}
         self.of_blocks: dict[ChannelKey, Any] = {}
+        self.antennas: dict[str, StateReader] = {}
         self.channels: dict[ChannelKey, Channel] = {}
         self.policies: dict[ChannelKey, Policy] = {}
         self.standing: dict[str, str] = {}
@@ -155,6 +159,9 @@ class State:
         moving = self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, held)
         if bias is not None and bias_slot is not None:
             moving.constants.append((bias_slot, *bias[1:]))
+        antenna, at = (Gps2D(), ORIGIN[3]) if robot.motion.space.axes == 1 else (Gps3D(), ORIGIN[7])  # of fixes
+        reader = self.antennas[robot.name] = StateReader(antenna, robot.motion, at, -1)
+        reader.gate = settings.association.threshold(len(antenna.columns), reader.gate)
         for name, mount in robot.sensors.items():
             mount_slot, block = -1, mount.block(name)
             if block is not None:  # the mount calibrates itself

@@ -9,11 +9,8 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.errors import MapError
 from kalmark.events import Event, Fix, Scan
-from kalmark.filter.estimators import Correction, Update
-from kalmark.geometry.pose_frames import ORIGIN
+from kalmark.filter.estimators import Correction
 from kalmark.geometry.spaces import SE2, SE3, Space
-from kalmark.models.observe import view_of
-from kalmark.models.sensors import Gps2D, Gps3D
 from kalmark.report import JudgedScan, Observation, Report, outcomes_of
 from kalmark.slam import moves, relocation_by_fixes
 from kalmark.slam.checks import refuse_bad_fix
@@ -22,20 +19,17 @@ from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
 from kalmark.slam.reader import StateReader
 from kalmark.slam.state import State
 
-ANTENNAS = {2: Gps2D(), 3: Gps3D()}  # a fix is a reading of one
-FIX_GATES = {2: 18.42, 3: 21.11}  # squared distances that .9999 of good fixes stay within
-
 
 def correct_by_reading(state: State, event: Scan, reader: StateReader) -> Report:
     """Correct by what a sensor measures of its own robot; leave a clone where its next readings count from here."""
     key, R, report = (event.robot, event.sensor), reader.noise(event), Report(event, event.y)
-    begins = reader.begins_ns(event)
+    begins, ids = reader.begins_ns(event), event.ids or [None] * len(event.y)
     state.t_ns = event.t_ns
     report.gaps = moves.advance(state, event.robot)
     if not len(event.y) and reader.keep == 1:
         return report
     if not reader.counts and state.repeats(key, event.t_ns, event.y):
-        return record_repeated_reading(report, [None] * len(event.y), R.shape[1], event.robot)
+        return record_repeated_reading(report, ids, R.shape[1], event.robot)
     other = state.pose_hypotheses.get(event.robot)
     sum_ = state.sums.get(event.robot)
     others = [*([] if other is None else [other]), *([] if sum_ is None else sum_.all())]
@@ -58,7 +52,7 @@ def correct_by_reading(state: State, event: Scan, reader: StateReader) -> Report
         done = state.corrected(update, event, estimator)
         done = done._replace(e=done.e[:, : event.width])
         report.fill([k], done)
-        found += outcomes_of(JudgedScan([k], [None] * len(event.y), [event.robot], done, reader.gate))
+        found += outcomes_of(JudgedScan([k], ids, [event.robot], done, reader.gate))
         if done.fused[0] and not is_loop:
             reader.take(event.y[k : k + 1], done.Z, since_s)
         if reader.is_position:
@@ -91,25 +85,13 @@ def correct_by_rest(state: State, event: Event) -> Observation | None:
 
 
 def fix(state: State, event: Fix) -> Report:
-    """Correct by a position from outside; place a robot again where fixes that agree show that it is lost."""
-    pose, size = (3, 2) if state.robots[event.robot].motion.space.axes == 1 else (7, 3)
-    refuse_bad_fix(event, size)
-    state.t_ns = event.t_ns
-    gaps = moves.advance(state, event.robot)
-    slot, report = state.moving[event.robot].slot, Report(event, event.y.reshape(1, size))
-    report.gaps = gaps
-    if state.repeats((event.robot, ""), event.t_ns, report.y):
-        return record_repeated_reading(report, [event.robot], size, event.robot)
-    gate, R = state.settings.association.threshold(size, FIX_GATES[size]), event.cov.reshape(1, size, size)
-    update = Update(view_of(ANTENNAS[size], None, ORIGIN[pose]), slot, -1, np.array([slot]), 0, report.y, R, gate)
-    estimator, other = state.estimator.for_fixes(), state.pose_hypotheses.get(event.robot)
-    fits = other is not None and other.correct(estimator, update)
-    if event.robot in state.sums:
-        state.sums[event.robot].correct(estimator, update)
-    done = state.corrected(update, event, estimator)
-    report.e, report.z, report.Z = done.e, done.z, done.Z
-    report.judged = (JudgedScan([0], [event.robot], [event.robot], done, gate),)
-    report.replaced = _record_position(state, event.robot, event.y, event.cov, done, fits)
+    """Correct by a position from outside, the reading of an antenna; place a lost robot again where fixes agree."""
+    antenna = state.antennas[event.robot]
+    refuse_bad_fix(event, len(antenna.sensor.columns))
+    y, cov = event.y[None], event.cov[None]
+    reading = Scan(t_ns=event.t_ns, robot=event.robot, sensor="", y=y, ids=[event.robot], cov=cov)
+    report = correct_by_reading(state, reading, antenna)
+    report.event = event
     return report
 
 
