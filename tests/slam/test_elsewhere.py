@@ -105,6 +105,27 @@ def test_a_robot_that_is_carried_away_is_found(ids: bool, surveyed: str, seed: i
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_a_carried_robot_began_before_it_saw_an_old_landmark_is_none(seed: int) -> None:
+    """With ids, it sees new trees alone for 1 s, which fit wherever it is; from then on old ones, too."""
+    poses, jump, skip = path(3), 750, 200
+    new = poses[jump + skip, :2] + np.array([(2.0, 1.5), (2.5, -1.0), (-1.0, 2.0)])
+    places, t_s = np.concatenate([trees(seed), new]), jump / RATE_HZ
+    slam, first = slam_at(poses[0], ids=True), len(places) - len(new)
+    for event in log_of(poses, places, seed, True, jump, skip):
+        if isinstance(event, km.Control):
+            slam.process(event)
+            continue
+        assert isinstance(event, km.Scan) and event.ids
+        is_new = np.array(event.ids) >= first
+        shown = ~is_new if event.t_s < t_s else is_new | (event.t_s > t_s + 1.0)
+        slam.process(km.Scan(event.t_s, "rover", "laser", event.y[shown], ids=np.array(event.ids)[shown].tolist()))
+    found = slam.landmarks()
+    off = np.linalg.norm(np.array(found.means)[:, :2] - places[np.array(found.ids, dtype=np.int64)], axis=1)
+    assert off.max() < 0.8
+    assert {*range(first, len(places))} <= {*found.ids}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_robot_is_found_by_a_sensor_whose_limits_are_not_stated(seed: int) -> None:
     """Its range is counted from its observations; landmarks beyond it contradict no pose."""
     _, events, poses = carried_log(seed, ids=False)

@@ -79,10 +79,10 @@ def test_two_that_are_one_have_all_observations_of_both_and_the_fewer_misses_in_
     tracks.note_scan(["a", "c"])
     tracks.note_scan(["b", "d"])
     kept, gone = tracks.confirmed["a"], tracks.confirmed["b"]
-    kept.observations, kept.seen, kept.absent, kept.missed = 10, 4, 1.5, 3.0
-    gone.observations, gone.seen, gone.absent, gone.missed = 5, 2, 0.25, 0.5
+    kept.observations, kept.seen, kept.absent, kept.missed, kept.last = 10, 4, 1.5, 3.0, (7, "r")
+    gone.observations, gone.seen, gone.absent, gone.missed, gone.last = 5, 2, 0.25, 0.5, (9, "r")
     tracks.merge(kept, gone)
-    assert (kept.observations, kept.seen, kept.absent, kept.missed) == (15, 6, 1.75, 0.5)
+    assert (kept.observations, kept.seen, kept.absent, kept.missed, kept.last) == (15, 6, 1.75, 0.5, (9, "r"))
     tracks.remove("b")
     assert kept.covisible == {"a", "c", "d"}
     assert tracks.confirmed["d"].covisible == {"a", "d"}
@@ -90,7 +90,8 @@ def test_two_that_are_one_have_all_observations_of_both_and_the_fewer_misses_in_
 
 def test_observations_that_are_used_are_counted_of_landmarks_of_the_map_only() -> None:
     tracks = tracks_of("a", "b")
-    tracks.count(["a", "r", "z", "a", "b"], [True, True, True, True, False])
+    tracks.count(["a", "r", "z", "a", "b"], [True, True, True, True, False], (5, "r"))
+    assert {name: track.last for name, track in tracks.confirmed.items()} == {"a": (5, "r"), "b": (0, "")}
     assert {name: track.observations for name, track in tracks.confirmed.items()} == {"a": 3, "b": 1}
 
 

@@ -55,7 +55,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     report.e, report.z, report.Z = done[:3]
     judged = JudgedScan(range(len(ids)), ids, ids, done, gate)
     report.judged = (judged,)
-    tracks.count(ids, used)
+    tracks.count(ids, used, (event.t_ns, name))
     if report.gaps and any(used):
         moving.held.located(event.t_ns)
     if scan is not None:

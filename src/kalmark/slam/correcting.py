@@ -64,7 +64,7 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
                 else _outliers(scan, model, slots, rows, update, done)
             )
             tentative.contest(state, scan, model, judged[-1], misfits, policy.upkeep.odds)
-        state.tracks.count(names, done.fused.tolist())
+        state.tracks.count(names, done.fused.tolist(), (scan.event.t_ns, scan.event.robot))
         scan.add_reports(names, rows, done.fused.tolist())
     return judged, found + _average(state, scan, decisions) if policy.averages else found
 
@@ -146,5 +146,6 @@ def _average(state: State, scan: ScanContext, decisions: Sequence[Decision]) -> 
         rows = [k for k in found.rows.tolist() if isinstance(decisions[k][0], Mixture)]
         return [Observation(k, None, "rejected", None, None, INDEFINITE) for k in rows]
     of_these = outcomes(found, decisions, d2)
-    state.tracks.count([o.landmark for o in of_these], [o.outcome == "associated" for o in of_these])
+    by = scan.event.t_ns, scan.event.robot
+    state.tracks.count([o.landmark for o in of_these], [o.outcome == "associated" for o in of_these], by)
     return of_these

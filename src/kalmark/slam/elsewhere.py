@@ -9,6 +9,7 @@ there; what was mapped meanwhile goes.
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,7 +38,7 @@ from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import Space
 from kalmark.management import existence
 from kalmark.report import ELSEWHERE, Gap
-from kalmark.slam.evidence import Evidence
+from kalmark.slam.evidence import RECENT, Evidence
 from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
 from kalmark.slam.state import State
 from kalmark.tracks.channel import EUCLIDEAN
@@ -86,10 +87,10 @@ def hold_back_far(
     far = _far(scan, update, done, limit_of(state, scan))
     if not far:
         return done
-    of = state.evidence.setdefault(scan.event.robot, Evidence())
+    of = _evidence(state, scan.event.robot)
     fits = np.flatnonzero(done.fused).tolist()
-    of.miss((names[k] for k in far), [-SURE] * len(far), scan.event.t_ns, state.is_surveyed)
-    of.see((names[k] for k in fits), [SURE] * len(fits), scan.event.t_ns, state.is_surveyed)
+    of.miss((names[k] for k in far), [-SURE] * len(far), scan.event.t_ns, state.begun_ns)
+    of.see((names[k] for k in fits), [SURE] * len(fits), scan.event.t_ns, state.begun_ns)
     of.weigh()
     out = [k for k in far if done.d2[k] <= update.gate]
     of.held += len(of.missed) >= SEVERAL and not of.fitted
@@ -114,11 +115,27 @@ def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> l
     return [k for k, is_one in zip(far, is_seen.tolist(), strict=True) if is_one]
 
 
+def _evidence(state: State, robot: str) -> Evidence:
+    """Return the evidence of a robot; new, it has the landmarks with ids that fitted when the robot saw them last."""
+    if robot not in state.evidence:
+        invented, tracks = state.tracks.is_invented, state.tracks.confirmed.values()
+        named = (track for track in tracks if track.last[1] == robot and not invented(track.id))
+        last = reversed(heapq.nlargest(RECENT, named, key=lambda track: track.last))
+        state.evidence[robot] = Evidence({t.id: (state.begun_ns(t.id), t.last[0], SURE) for t in last})
+    return state.evidence[robot]
+
+
+def _young(state: State, robot: str, of: Evidence) -> list[Id]:
+    """Return the landmarks of the map that a robot began since the onset."""
+    begun = ((name, track.begun) for name, track in state.tracks.confirmed.items())
+    return [name for name, (t_ns, by) in begun if by == robot and t_ns > of.since_ns]
+
+
 def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | None) -> None:
     """Count the landmarks that a scan observed and missed, and place its robot where the odds suffice."""
     robot = scan.event.robot
     if look is not None or scan.adrift:
-        state.evidence.setdefault(robot, Evidence())
+        _evidence(state, robot)
     of, all_named = state.evidence.get(robot), None not in scan.ids
     if of is None or not scan.report.observations:
         return
@@ -140,16 +157,15 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
 
 
 def _note(state: State, scan: ScanContext, of: Evidence, look: existence.ObservedAndMissed | None) -> None:
-    """Take note of the landmarks that a scan saw, missed and began."""
+    """Take note of the landmarks that a scan saw and missed."""
     made, t_ns = scan.report.observations, scan.event.t_ns
     if look is not None:
         log_miss = scan.tracks.looks[scan.key].log_miss
-        of.miss(look.missed, [weight * log_miss for weight in look.missed.values()], t_ns, state.is_surveyed)
+        of.miss(look.missed, [weight * log_miss for weight in look.missed.values()], t_ns, state.begun_ns)
     seen = [o for o in made if o.outcome == "associated" and (look is not None or o.id is not None)]
     if seen:
         logs = _log_chance(scan, [o.index for o in seen], look.density if look is not None else 0.0)
-        of.see((o.landmark for o in seen if o.landmark is not None), -logs, t_ns, state.is_surveyed)
-    of.begin((o.landmark for o in made if o.outcome == "new" and o.landmark is not None), t_ns)
+        of.see((o.landmark for o in seen if o.landmark is not None), -logs, t_ns, state.begun_ns)
     of.weigh()
 
 
@@ -167,7 +183,7 @@ def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | N
 
 def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
     """Return the landmarks that were in the map before, as they are now."""
-    tracks, young, channel = state.tracks, of.young, scan.channel
+    tracks, young, channel = state.tracks, _young(state, scan.event.robot, of), scan.channel
     kind = channel.landmark.kind if channel.gives_places else EUCLIDEAN[scan.dimensions - 2]
     known, old = tracks.known.of_kind.get(kind), Known(channel.models[kind].landmark)
     for name in known.names if known is not None else ():
@@ -192,8 +208,8 @@ def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[
     ]
     more += [
         (None, (*state.map.mean(tracks.slots[name])[:d].tolist(), float(np.median(sigma))))
-        for name in of.young
-        if name in tracks.confirmed and name not in shown and tracks.is_invented(name)
+        for name in _young(state, scan.event.robot, of)
+        if name not in shown and tracks.is_invented(name)
     ]
     if more:
         rows = np.array([place for _, place in more])
@@ -297,11 +313,11 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
     F, Q = np.eye(len(rows)), np.zeros((len(rows), len(rows)))
     F[: len(cov)], Q[: len(cov), : len(cov)] = 0.0, cov
     F[:dof, len(cov) :] = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] for name in mapped)])
-    of.weigh(_mapped_again(state, scan, of, before, after, cov))
+    of.weigh(_mapped_again(state, scan, before, after, cov))
     state.map.predict(rows, F, Q)
     for one in own:
         state.map.set_predicted(one, other.map.mean(one))
-    for name in [name for name in of.young if name in tracks.confirmed]:
+    for name in _young(state, robot, of):
         state.remove(name)
         scan.report.removed += ((name, MEANWHILE),)
     for track in [*tracks.tentative.values()]:
@@ -328,9 +344,9 @@ def report_found(state: State, scan: ScanContext, since_ns: int, before: Array) 
 
 
 def _mapped_again(
-    state: State, scan: ScanContext, of: Evidence, before: Array, after: Array, cov: Array
-) -> dict[Id, float]:  # fmt: skip
-    """Return the log probabilities that landmarks are at older ones by chance, of those that are there.
+    state: State, scan: ScanContext, before: Array, after: Array, cov: Array
+) -> list[tuple[int, float]]:  # fmt: skip
+    """Return when landmarks were begun, and the log probabilities that they are at older ones by chance, if they are.
 
     They are moved with their robot from where it was `before` to where it is `after`, with the covariance `cov`.
     """
@@ -338,12 +354,12 @@ def _mapped_again(
 
     tracks, d, pose = state.tracks, scan.dimensions, len(scan.channel.at)
     frame, dof, kind = FRAMES[pose], scan.channel.pose_dof, scan.channel.landmark.kind
-    names = [n for n, track in tracks.confirmed.items() if n in of.seen and track.model.kind == kind]
+    names = [name for name, track in tracks.confirmed.items() if track.model.kind == kind]
     if kind not in EUCLIDEAN or len(names) < SEVERAL:
-        return {}
-    places, begun = state.map.means(tracks.slots_of(names), d), np.array([of.seen[n][0] for n in names])
+        return []
+    places, begun = state.map.means(tracks.slots_of(names), d), np.array([*map(state.begun_ns, names)])
     tree = cKDTree(places)
-    spacing, out = np.median(tree.query(places, 2)[0][:, 1]), dict[Id, float]()
+    spacing, out = np.median(tree.query(places, 2)[0][:, 1]), list[tuple[int, float]]()
     for name, place, t_ns in zip(names, places, begun, strict=True):
         v, V_r, V_l = (part[0] for part in frame.to_frame(before[:pose], place[None]))
         p, P_r, P_v = (part[0] for part in frame.from_frame(after[:pose], v[None]))
@@ -358,7 +374,7 @@ def _mapped_again(
         volume = 4.0 * gate(SURVEYED, d) ** (d / 2) * math.sqrt(max(np.linalg.det(C), 0.0))
         z, chance = p - places[nearest], volume / spacing**d
         if z @ np.linalg.solve(C, z) <= gate(SURVEYED, d) and chance < 1.0:
-            out[name] = math.log(max(chance, math.exp(-SURE)))
+            out.append((int(t_ns), math.log(max(chance, math.exp(-SURE)))))
     return out
 
 

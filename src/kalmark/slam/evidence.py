@@ -13,7 +13,7 @@ Once it is known where the robot is instead, those begun since s that are older 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -23,7 +23,8 @@ from kalmark.association.global_start import SURE
 from kalmark.events import Id
 
 MOST, RECENT = 64, 256  # landmarks whose misses count most, and that were seen last, which outweigh all others
-NEVER_NS, MAPPED_NS = -1, 0  # when landmarks begin that were surveyed, and that were mapped before what is recorded
+NEVER_NS = -(2**62)  # when landmarks begin that were surveyed
+EQUAL = 1e-9  # between two ratios that are one but for rounding
 
 
 @dataclass
@@ -45,46 +46,38 @@ class Evidence:
     gain: float = 0.0
     fitted: set[Id] = field(default_factory=set)
 
-    def begin(self, names: Iterable[Id], t_ns: int) -> None:
-        """Take note of landmarks that were begun."""
-        self.seen |= {name: (t_ns, t_ns, 0.0) for name in names}
-
-    def see(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, surveyed: Callable[[Id], bool]) -> None:
+    def see(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, begun_ns: Callable[[Id], int]) -> None:
         """Take note of landmarks that were seen where they are expected."""
         for name, log in zip(names, logs, strict=True):
-            begun = self.seen.pop(name, (NEVER_NS if surveyed(name) else MAPPED_NS,))[0]
-            self.seen[name] = begun, t_ns, min(float(log), SURE)  # the last one of all
+            self.seen.pop(name, None)
+            self.seen[name] = begun_ns(name), t_ns, min(float(log), SURE)  # the last one of all
             self.missed.pop(name, None)
 
-    def miss(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, surveyed: Callable[[Id], bool]) -> None:
+    def miss(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, begun_ns: Callable[[Id], int]) -> None:
         """Take note of landmarks that were not seen where they are expected, or elsewhere."""
         for name, log in zip(names, logs, strict=True):
-            last = self.seen[name][1] if name in self.seen else NEVER_NS if surveyed(name) else MAPPED_NS
+            last = self.seen[name][1] if name in self.seen else begun_ns(name)
             self.missed.setdefault(name, (last, t_ns, max(float(log), -SURE)))
         most = sorted(reversed(self.missed), key=lambda name: self.missed[name][2])[:MOST]
-        self.missed = {name: told for name, told in self.missed.items() if name in most}
+        self.missed = {name: since for name, since in self.missed.items() if name in most}
 
-    def weigh(self, again: Mapping[Id, float] | None = None) -> None:
-        """Find the onset of the least ratio.
+    def weigh(self, again: Sequence[tuple[int, float]] = ()) -> None:
+        """Find the onset of the least ratio, the last one of several.
 
-        The landmarks mapped `again`, with their logs, are older ones if the robot was elsewhere when they were begun.
+        Each landmark counts for the onsets s of an interval: a missed one from when it was seen last until it is
+        missed, a seen one from when it was begun until it was seen.  Those begun `again` at these times, with their
+        logs, count until then: they are older ones if the robot was elsewhere when they were begun.
         """
         if not self.missed:
             self.ratio = 0.0
             return
-        last, first, logs = (np.array(column) for column in zip(*self.missed.values(), strict=True))
-        again = again or {}
-        mapped = np.array([self.seen[name][0] for name in again], dtype=np.int64)
-        s = np.unique(np.concatenate([last, first - 1, mapped - 1]))
-        ratios = logs @ ((last[:, None] <= s) & (s < first[:, None]))
-        if self.seen:
-            recent = islice(reversed(self.seen.values()), RECENT)
-            begun, seen, gains = (np.array(column) for column in zip(*recent, strict=True))
-            ratios = ratios + gains @ ((begun[:, None] <= s) & (s < seen[:, None]))
-        ratios = ratios + np.array([*again.values()]) @ (s < mapped[:, None])
-        self.ratio, self.since_ns = float(ratios.min()), int(s[np.flatnonzero(ratios == ratios.min())[-1]])
-
-    @property
-    def young(self) -> set[Id]:
-        """The landmarks that were begun since the onset."""
-        return {name for name, (begun, _, _) in self.seen.items() if begun > self.since_ns}
+        recent = islice(reversed(self.seen.values()), RECENT)
+        terms = [*self.missed.values(), *recent, *((NEVER_NS, begun, log) for begun, log in again)]
+        begin, end, logs = (np.array(column) for column in zip(*terms, strict=True))
+        is_missed = np.arange(len(logs)) < len(self.missed)
+        times, at = np.unique(np.concatenate([begin, end]), return_inverse=True)
+        ratios = np.cumsum(np.bincount(at, np.concatenate([logs, -logs])))
+        some = np.cumsum(np.bincount(at, np.concatenate([is_missed, -1.0 * is_missed]))) > 0.5
+        least = ratios[some].min()
+        last = np.flatnonzero(some & (ratios <= least + EQUAL))[-1]
+        self.ratio, self.since_ns = float(least), int(times[last + 1] - 1)

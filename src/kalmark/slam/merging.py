@@ -134,6 +134,6 @@ def _displace(state: State, scan: ScanContext, repeat: Repeat) -> bool:
         state.map.set_predicted(slot, mean)
     of = state.evidence.get(scan.event.robot)
     if inside and of is not None:
-        since_ns = min((of.seen[name][0] for name in repeat.newer if name in of.seen), default=scan.event.t_ns)
+        since_ns = min(state.begun_ns(name) for name in repeat.newer)
         elsewhere.report_found(state, scan, since_ns, before)
     return True

@@ -52,7 +52,8 @@ def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name:
     tentative = held or (name in (NEW, REMAP) and policy.upkeep.confirm > 1)
     name = state.tracks.new_name() if isinstance(name, Answer) else name
     try:
-        track = Track(name, channel.landmark, state.add_seen(start), size_m=scan.size_of(k))
+        slot, by = state.add_seen(start), (scan.event.t_ns, scan.event.robot)
+        track = Track(name, channel.landmark, slot, size_m=scan.size_of(k), begun=by, last=by)
     except MapError as full:
         return Observation(k, id_, "ignored", None, None, str(full))
     if channel.joins:
@@ -129,7 +130,9 @@ def _refusal(state: State, scan: ScanContext, policy: Policy, k: int, name: Any,
 def _defer_initialization(state: State, scan: ScanContext, way: Initialization, k: int, name: Id) -> Observation:
     """Take a measurement that alone does not determine a landmark; start the landmark if all of them do."""
     track = state.tracks.pending.get(name)
-    track = track or Track(name, scan.channel.landmark, status=Status.PENDING, pending=Pending(scan.key, name))
+    if track is None:
+        pending, by = Pending(scan.key, name), (scan.event.t_ns, scan.event.robot)
+        track = Track(name, scan.channel.landmark, status=Status.PENDING, pending=pending, begun=by)
     try:
         step = way.observe(scan, k, track.pending or Pending(scan.key, name))
         if step.start is not None and not step.start.is_finite:
@@ -209,7 +212,10 @@ def initialize_delayed(
             else:
                 name = state.tracks.new_name() if best[k].name is None else best[k].name
                 assert name is not None
-                state.tracks.confirm(Track(name, scan.channel.landmark, slot), len(outcome.used.measurements))
+                track = Track(
+                    name, scan.channel.landmark, slot, begun=(outcome.used.measurements[0].t_ns, scan.event.robot)
+                )
+                state.tracks.confirm(track, len(outcome.used.measurements))
                 candidates = delayed.drop_explained(scan, candidates, outcome.used, slot)
         found.append(Observation(k, i, "deferred" if name is None else "new", name, None, reason))
     for number in state.clones.of(key)[: -way.poses]:

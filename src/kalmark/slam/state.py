@@ -22,7 +22,7 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.protocols import Landmark, OfState, measures_blocks, world_of
 from kalmark.models.sensors import Gps2D, Gps3D
 from kalmark.slam.checks import check_covariance, fault_of, instance, refuse_odd_association, require_methods
-from kalmark.slam.evidence import Evidence
+from kalmark.slam.evidence import NEVER_NS, Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import SELDOM, LastMeasurement
@@ -306,6 +306,12 @@ class State:
     def is_surveyed(self, name: Id) -> bool:
         """Return whether a landmark was given, and not mapped from here."""
         return name in self.tracks.known or name in self.surveys.trial or name in self.surveys.trusted
+
+    def begun_ns(self, name: Id) -> int:
+        """Return the time of the observation that began a landmark; `NEVER_NS` of one that is surveyed, 0 of others."""
+        if self.is_surveyed(name):
+            return NEVER_NS
+        return self.tracks.confirmed[name].begun[0] if name in self.tracks.confirmed else 0
 
     def settle(self) -> None:
         """Notify sources that something else than their scans changes the map."""

@@ -163,7 +163,13 @@ def _begin(state: State, scan: ScanContext, name: Id, k: int, before: Track | No
         start = scan.start_of(k)
         if not start.is_finite:
             return
-        track = Track(f"other place of {name}", scan.channel.landmark, state.add(start), size_m=scan.size_of(k))
+        track = Track(
+            f"other place of {name}",
+            scan.channel.landmark,
+            state.add(start),
+            size_m=scan.size_of(k),
+            begun=(scan.event.t_ns, scan.event.robot),
+        )
         against, track.entered = state.tracks.confirmed[name].observations - 1, state.tracks.changes
         track.status, track.of, track.log_odds = Status.TENTATIVE, name, -OUTLIER * against
         if before is not None:

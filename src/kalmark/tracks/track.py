@@ -79,9 +79,11 @@ class Track:
     compared with others.  `extent` (2,) are the abscissas of the segment observed of a line, `size_m` is the measured
     size of a tag.  `first` is the observation that started it, and
     `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
-    `entered` counts the changes of the map before it came into it.  A tentative one may be where observations `of` a
-    landmark have it that do not fit that: then `log_odds` are those that it is right, and `covisible` are the landmarks
-    entered before it that fitted meanwhile.  `classes` are the log-likelihoods of the classes that it may be of.
+    `entered` counts the changes of the map before it came into it.  `begun` are time and robot of the observation that
+    began it, `last` those of the last one that was used, (0, "") of one that was given.  A tentative one may be where
+    observations `of` a landmark have it that do not fit that: then `log_odds` are those that it is right, and
+    `covisible` are the landmarks entered before it that fitted meanwhile.  `classes` are the log-likelihoods of the
+    classes that it may be of.
     """
 
     id: Id
@@ -107,6 +109,8 @@ class Track:
     measurements: list[Measurement] = field(default_factory=list)
     of: Id | None = None
     entered: int = 0
+    begun: tuple[int, str] = (0, "")
+    last: tuple[int, str] = (0, "")
     classes: LogClasses = field(default_factory=dict)
 
     def restored(self) -> None:
@@ -226,7 +230,7 @@ class Tracks:
         """Let one track have what is known of another, which is to be removed: they are one landmark."""
         kept.observations += gone.observations
         kept.seen, kept.absent = kept.seen + gone.seen, kept.absent + gone.absent
-        kept.missed = min(kept.missed, gone.missed)
+        kept.missed, kept.last = min(kept.missed, gone.missed), max(kept.last, gone.last)
         for name in list(gone.covisible):
             if name in self.confirmed:
                 self.confirmed[name].covisible.add(kept.id)
@@ -234,11 +238,12 @@ class Tracks:
         for name, log_p in gone.classes.items():
             kept.classes[name] = kept.classes.get(name, 0.0) + log_p
 
-    def count(self, names: Iterable[Any], used: Iterable[bool]) -> None:
-        """Count observations that were used, each at its landmark; those of robots are not counted."""
+    def count(self, names: Iterable[Any], used: Iterable[bool], by: tuple[int, str]) -> None:
+        """Count observations that were used, `by` a robot at a time, at their landmarks; robots are not counted."""
         for track, fused in zip(map(self.confirmed.get, names), used, strict=False):
             if fused and track:
                 track.observations += 1
+                track.last = by
 
     def note_scan(self, names: list[Id]) -> None:
         """Note the landmarks that were observed in one scan: they are covisible, and so different ones."""
