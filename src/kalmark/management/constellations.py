@@ -42,7 +42,11 @@ class Places(NamedTuple):
 @compiled
 def are_two(of: Places, a: int, b: int) -> bool:
     """Return whether landmarks are certainly two: they were seen together, or have two ids."""
-    return bool(a == b or (of.given[a] and of.given[b]) or (of.seen[of.first[a] : of.first[a + 1]] == b).any())
+    two = a == b or (of.given[a] and of.given[b])
+    k = of.first[a]
+    while not two and k < of.first[a + 1]:
+        two, k = of.seen[k] == b, k + 1
+    return bool(two)
 
 
 @compiled
@@ -168,9 +172,9 @@ def area(a: Complex, b: Complex, c: Complex) -> float:
 @compiled
 def is_inside(corners: Complex, z: Complex) -> bool:
     """Return whether a place is inside a convex polygon with these corners (H,)."""
-    inside = len(corners) > 2
-    for k in range(len(corners)):
-        inside &= area(corners[k - 1], corners[k], z) >= 0.0
+    inside, k = len(corners) > 2, 0
+    while inside and k < len(corners):
+        inside, k = area(corners[k - 1], corners[k], z) >= 0.0, k + 1
     return inside
 
 
@@ -183,9 +187,10 @@ def agreement_with_itself(of: Places, part: Index) -> tuple[Index, Index, int]:
     """
     z, corners, is_in = of.z, hull(of, part), np.zeros(len(of.z), np.bool_)
     is_in[part] = True
-    edges = [(a, b, abs(z[a] - z[b])) for a in part for b in part
-             if a != b and (np.abs(z[part] - z[a]) < abs(z[b] - z[a])).sum() <= NEAREST]  # fmt: skip
-    alike = [(a, b, c, d) for a, b, r in edges for c, d, s in edges if abs(r - s) <= 2.0 * of.tolerance
+    r = [np.abs(z[part] - z[a]) for a in part]
+    edges = [(part[i], part[j], r[i][j]) for i in range(len(part)) for j in range(len(part))
+             if i != j and (r[i] < r[i][j]).sum() <= NEAREST]  # fmt: skip
+    alike = [(a, b, c, d) for a, b, long in edges for c, d, other in edges if abs(long - other) <= 2.0 * of.tolerance
              and a != c and b != d and are_two(of, a, c) and are_two(of, b, d)]  # fmt: skip
     chosen = alike[:: max(1, -(-len(alike) // MOVES))]
     agreeing, among = np.full(len(chosen), -2), np.full(len(chosen), -2)
