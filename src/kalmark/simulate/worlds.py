@@ -128,7 +128,7 @@ class World(OfFile):
                 of = self.world.gives_raw
                 if not of:
                     worlds = " or ".join(entry_points_of("layouts"))
-                    raise unexpected_value(f"images in a world that has them: {worlds}")
+                    raise unexpected_value(f"images only in a world of one of these types: {worlds}")
                 if (kind := robot.sensors[sensor].type) not in of:
                     raise unexpected_value(f"images of {' or '.join(of)}, not of {sensor!r}, a {kind}")
         scenery = self.world.scenery(np.random.default_rng(0))

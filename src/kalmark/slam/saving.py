@@ -248,7 +248,7 @@ def _check_measurements(state: State) -> None:
             raise MapError(f"a measurement of {m.robot!r}, {m.sensor!r} is {m.y.tolist()}")
     channels = {(name, sensor) for name, robot in robots.items() for sensor in robot.sensors}
     if not {*clones.users(), *(p.channel for p in tracks.waiting()), *tracks.candidates} <= channels:
-        raise MapError("clones or pending measurements are of sensors that there are not")
+        raise MapError("clones or pending measurements name sensors that no robot has")
 
 
 def _count(value: Any, what: str) -> int:
