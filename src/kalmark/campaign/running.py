@@ -328,7 +328,7 @@ def worker_died(error: BaseException | None) -> bool:
 
 
 def check_backend(backend: str, address: str | None) -> None:
-    """Refuse a backend that there is not, and an address for one that takes none."""
+    """Refuse an unknown backend, and an address for one that takes none."""
     if backend not in BACKENDS:
         raise KalmarkError(f"campaign: backend is {backend!r}, {one_near(BACKENDS, backend)}")
     if address is not None and backend == "loky":

@@ -111,7 +111,7 @@ def parse_estimator(label: str) -> tuple[str, dict[str, str]]:
 
 
 def refuse_unknown(estimators: Sequence[str] | None) -> None:
-    """Refuse estimators that there are not, or that are given twice, before anything is simulated."""
+    """Refuse unknown estimators, and those that are given twice, before anything is simulated."""
     known = Choice("estimator")
     if estimators is not None and not estimators:
         raise ConfigError(f"campaign: got no estimator, expected one of {', '.join(known.names())}")

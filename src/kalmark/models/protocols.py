@@ -740,7 +740,7 @@ def refuse_misspelt_names(model: object, what: str) -> None:
 
 
 def refuse_other_views(sensor: object, what: str) -> None:
-    """Refuse a sensor with `views` that there are not, or without the share that passes its gate.
+    """Refuse a sensor with unknown `views`, or without the share that passes its gate.
 
     Without that it would be taken for a sensor of landmarks.
     """

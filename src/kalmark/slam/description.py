@@ -181,7 +181,7 @@ def _options(of: type, said: Description, world: str = "") -> Description:
 def model_described(role: str, said: Mapping[str, Any], world: str = "") -> Any:
     """Return the model that `describe_model` describes, of the plane or of space where its type leaves that open.
 
-    The height of a sensor of the plane is that of its `mount`.  Raises ModelError for a type that there is not, and if
+    The height of a sensor of the plane is that of its `mount`.  Raises ModelError for an unknown type, and if
     the model refuses its parameters.
     """
     name = said.get("type", role)
