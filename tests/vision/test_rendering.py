@@ -135,7 +135,8 @@ def test_a_simulated_camera_gives_images_of_its_true_poses_from_the_start_on(tmp
 
 def test_images_want_a_world_of_textures_and_a_camera() -> None:
     room = "world={type: random_box}"
-    with pytest.raises(ConfigError, match="expected images only in a world of one of these types: textured_planes or textured_room"):
+    wanted = "expected images only in a world of one of these types: textured_planes or textured_room"
+    with pytest.raises(ConfigError, match=wanted):
         load_world("textured_room", [room])
     laser = "robots.robot.sensors.camera={type: range_bearing_3d, mount: {roll_deg: -90}}"
     kinds = "pinhole or pixel_depth or stereo or omnidirectional"
