@@ -833,7 +833,7 @@ def test_a_noise_that_was_found_before_a_systematic_error_counts_what_that_leave
 
 def test_an_error_of_controls_in_a_gap_of_them_is_no_cause() -> None:
     run: Any = SimpleNamespace(
-        history=SimpleNamespace(t_ns=np.array([10**9])),
+        history=SimpleNamespace(t_ns=np.array([10**9]), at_s=lambda _: 1.0),
         summary={"gaps": [{"robot": "a", "kind": "held", "start_s": 5.0, "end_s": 9.0}]},
     )
     slip = Finding("odometry_turn", ("a", "w_radps", "scale"), 90.0, 0.0, 1.0, Z=np.zeros(1), W=np.ones(1), since_s=4.5)

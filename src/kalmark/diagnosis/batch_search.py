@@ -147,9 +147,8 @@ def gated_noise_factors(run: Run) -> dict[Where, Array]:
     R - (1 - k) R Z^-1 R; its factor is taken from the diagonals of R and Z.
     """
     h, found = run.history, {}
-    robots = h.robot[h.step]
     for key, channel in run.final_slam().state.channels.items():
-        mine = (h.outcome == "associated") & (robots == key[0]) & (h.sensor == key[1])
+        mine = (h.outcome == "associated") & h.made_by(*key)
         k = truncated_variance(channel.gate, channel.dof)
         if k < 1.0 and mine.any():
             share = h.noise[mine] ** 2 / np.diagonal(h.Z[mine], axis1=1, axis2=2)

@@ -74,9 +74,9 @@ def _judged(history: History, of: str, which: str, rows: Ints, level: float) -> 
 
 def _groups(run: Run, rows: Ints) -> Iterator[tuple[str, str, Ints]]:
     history = run.history
-    robots, sensors = history.robot[history.step[rows]], history.sensor[rows]
-    for key in sorted({*zip(robots.tolist(), sensors.tolist(), strict=True)}):
-        mine = rows[(robots == key[0]) & (sensors == key[1])]
+    keys = history.sensor_keys()
+    for key in sorted({keys[k] for k in rows.tolist()}):
+        mine = rows[history.made_by(*key)[rows]]
         yield "sensor", ".".join(key), mine
         kind = str(run.section(*key).get("type", ""))
         columns = [name for name in ("range", "bearing") if name in kind]

@@ -102,10 +102,10 @@ def unseen_counts(run: Run) -> Revisits | None:
 def _visits(run: Run, robot: str) -> Iterator[tuple[int, int, float]]:
     """Yield of each time a landmark came into view again the scans in which it was, those that saw it, and the time."""
     h, where = run.history, _places(run)
-    used = (h.robot[h.step] == robot) & h.fused & np.isin(h.landmark, [*where])
+    used = (h.observers == robot) & h.fused & np.isin(h.landmark, [*where])
     if not used.any():
         return
-    steps = np.unique(h.step[(h.robot[h.step] == robot) & ~h.of_own])
+    steps = np.unique(h.step[(h.observers == robot) & ~h.of_own])
     poses, scan = h.poses[steps], np.searchsorted(steps, h.step[used])
     far, bearing = _view(poses[scan], np.array([where[name] for name in h.landmark[used].tolist()]))
     (low, high), most = np.quantile(bearing, EDGES), np.quantile(far, EDGES[1])
@@ -121,7 +121,7 @@ def _visits(run: Run, robot: str) -> Iterator[tuple[int, int, float]]:
         for visit in np.split(there, np.flatnonzero(np.diff(there) > LATER) + 1)[1:]:
             seen = int(np.isin(visit, mine).sum())
             if seen or len(visit) >= LEAST_SEEN:
-                yield len(visit), seen, float(h.t_ns[steps[visit[0]]]) * 1e-9
+                yield len(visit), seen, h.at_s(steps[visit[0]])
 
 
 def _view(poses: Array, places: Array) -> tuple[Array, Array]:
@@ -180,8 +180,8 @@ def vanished_landmarks(run: Run) -> list[Moment]:
     used = (h.id == "") & np.isin(h.outcome, ("associated", "new"))
     names, first = np.unique(h.landmark[used], return_index=True)
     begun = dict(zip(names.tolist(), h.step[used][first].tolist(), strict=True))
-    for robot in dict.fromkeys(h.robot[h.step[used]].tolist()):
-        steps, mine = np.flatnonzero(h.robot == robot), used & (h.robot[h.step] == robot)
+    for robot in dict.fromkeys(h.observers[used].tolist()):
+        steps, mine = np.flatnonzero(h.robot == robot), used & (h.observers == robot)
         seen: list[set[str]] = [set() for _ in steps]
         for k, name in zip(np.searchsorted(steps, h.step[mine]).tolist(), h.landmark[mine].tolist(), strict=True):
             seen[k].add(name)
@@ -197,6 +197,5 @@ def vanished_landmarks(run: Run) -> list[Moment]:
             anew = sum(begun[name] >= steps[k] for name in later)
             gone = len(before & later) <= FEW_BACK * len(before) and anew >= max(LEAST_SEEN, MOSTLY * len(later))
             score = -len(before) * np.log1p(-again / total) - np.log(len(steps) / SELDOM)
-            t_s = float(h.t_ns[steps[k]]) * 1e-9
-            found.append(Moment(int(steps[k]), t_s, robot, len(before), float(score) if gone else 0.0))
+            found.append(Moment(int(steps[k]), h.at_s(steps[k]), robot, len(before), float(score) if gone else 0.0))
     return found

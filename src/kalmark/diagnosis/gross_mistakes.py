@@ -255,7 +255,7 @@ def _at(stated: Mapping[str, float]) -> str:
 def _fit_of_fixes(run: Run, number: int | None = None) -> Fit:
     """Return the fit of the first fixes of a run."""
     fixes = run.history.fixes[:number]
-    d2 = [float(f.z @ np.linalg.solve(f.Z, f.z)) / len(f.z) for f in fixes]
+    d2 = [f.d2 / len(f.z) for f in fixes]
     values, dof = np.minimum(d2, MOST), np.array([len(f.z) for f in fixes])
     return Fit(values, dof, -0.5 * values * dof)
 

@@ -44,7 +44,7 @@ def find_lost_robots(run: Run) -> Iterator[Lost]:
 def located_ns(run: Run, name: str) -> float:
     """Return when a robot was last placed by a thing in the map, a reading or a fix, ns; -inf if it never was."""
     h = run.history
-    placing = (h.robot[h.step] == name) & (h.outcome == "associated") & (_positions(run, name) | ~h.of_own)
+    placing = (h.observers == name) & (h.outcome == "associated") & (_positions(run, name) | ~h.of_own)
     times = [*h.t_ns[h.step[placing]].tolist(), *(fix.t_ns for fix in h.fixes if fix.robot == name and fix.used)]
     return max(times, default=-np.inf)
 
@@ -53,7 +53,7 @@ def _positions(run: Run, name: str) -> Flags:
     """Return which observations (O,) are readings of a robot's position."""
     h, readers = run.history, run.final_slam().state.readers
     placing = [key[1] for key, reader in readers.items() if key[0] == name and reader.is_position]
-    return np.asarray((h.robot[h.step] == name) & h.of_own & np.isin(h.sensor, placing))
+    return np.asarray((h.observers == name) & h.of_own & np.isin(h.sensor, placing))
 
 
 def unchecked_ends(run: Run) -> Iterator[tuple[str, Sign]]:
@@ -77,7 +77,7 @@ def unchecked_ends(run: Run) -> Iterator[tuple[str, Sign]]:
             if KNOWN**2 * after > before:
                 what = f"nothing places {name} in its last {figure(blind_s)} s: they are dead reckoning"
                 yield name, Sign(what, UNCHECKED)
-        mine = np.flatnonzero((h.robot[h.step] == name) & ~h.of_own)[-WINDOW:]
+        mine = np.flatnonzero((h.observers == name) & ~h.of_own)[-WINDOW:]
         if len(mine) == WINDOW and now[mine].mean() > MUCH * FITS:
             d2 = f"d2 per degree of freedom is {figure(float(now[mine].mean()), 2)}"
             yield (

@@ -58,7 +58,7 @@ def status_of(causes: Iterable[Cause]) -> str:
 
 def begin_s(run: Run) -> float:
     """Return the time of the first scan in the log."""
-    return float(run.history.t_ns[0]) * 1e-9 if len(run.history.t_ns) else 0.0
+    return run.history.at_s(0) if len(run.history.t_ns) else 0.0
 
 
 def cause_of_mistake(mistake: Mistake) -> Cause:
@@ -137,7 +137,7 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
     for robot in dict.fromkeys(h.robot.tolist()):
         bad = [k for k in worst.tolist() if h.robot[k] == robot][:WORST]
         controls = controls_of(run, log, robot)
-        odd = {o.t_s: (o, k) for k in bad if (o := controls.odd(h.t_ns[k] * 1e-9)) is not None}
+        odd = {o.t_s: (o, k) for k in bad if (o := controls.odd(h.at_s(k))) is not None}
         if odd:
             most, _ = max(odd.values(), key=lambda of: of[0].times)
             at = [f"{t_s:.1f}" for t_s in sorted(odd) if t_s != most.t_s]

@@ -181,7 +181,7 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
     Those of a mount are a turn in the plane.
     """
     robot, second, *rest = finding.of
-    of, s, first_s = run.final_slam().robots[robot], finding.value, float(run.history.t_ns[0]) * 1e-9
+    of, s, first_s = run.final_slam().robots[robot], finding.value, run.history.at_s(0)
     begin_s, end_s = (first_s + (t or 0.0) for t in (finding.since_s, finding.until_s))
     is_control = rest[-1:] in (["scale"], ["offset"])
     names = of.motion.columns if is_control else of.sensors[second].sensor.columns if second in of.sensors else ()

@@ -6,6 +6,7 @@ be the same for long; copies come in pairs.
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -56,9 +57,8 @@ def repeated_measurements(values: Array, first: Index) -> Flags:
 def repeated_scans(run: Run) -> Flags:
     """Return which observations (O,) of a run are in a scan that is a copy of the one before."""
     h, out = run.history, np.zeros(len(run.history.step), dtype=np.bool_)
-    robot = h.robot[h.step]
-    for key in sorted({*zip(robot.tolist(), h.sensor.tolist(), strict=True)}):
-        rows = np.flatnonzero((robot == key[0]) & (h.sensor == key[1]))
+    for key in sorted({*h.sensor_keys()}):
+        rows = np.flatnonzero(h.made_by(*key))
         _, first, count = np.unique(h.step[rows], return_index=True, return_counts=True)
         out[rows] = np.repeat(repeated_measurements(h.y[rows], first), count)
     return out
@@ -69,14 +69,13 @@ def copies(run: Run, log: Log) -> list[Copies]:
     h, slam = run.history, run.final_slam()
     given = {key: one for key, one in slam.state.given.items() if one.repeats >= max(LEAST, SELDOM * one.number)}
     found = [Copies(*key, one.repeats, one.number, one.since_ns * 1e-9, True) for key, one in given.items()]
-    same, robot = repeated_scans(run), run.history.robot[run.history.step]
-    for key in sorted({*zip(robot[same].tolist(), h.sensor[same].tolist(), strict=True)}):
+    same = repeated_scans(run)
+    for key in sorted({*compress(h.sensor_keys(), same)}):
         if key in given:
             continue
-        mine = (robot == key[0]) & (h.sensor == key[1])
+        mine = h.made_by(*key)
         steps = np.unique(h.step[mine & same])
-        since_s = float(h.t_ns[steps[0]]) * 1e-9
-        found.append(Copies(*key, len(steps), len(np.unique(h.step[mine])), since_s))
+        found.append(Copies(*key, len(steps), len(np.unique(h.step[mine])), h.at_s(steps[0])))
     for name in slam.robots:
         mine_ = [e for e in log.events if isinstance(e, Control) and e.robot == name and e.share == 1.0]
         twice = np.flatnonzero(repeated_measurements(np.array([e.u for e in mine_]), np.arange(len(mine_))))

@@ -218,7 +218,7 @@ def _meanings(again: Run, surveys: Mapping[str, Array], wrong: list[str]) -> dic
 
 def _since_s(run: Run, rows: Ints) -> float:
     """Return the time of the first of some rows, s of the log."""
-    return float(run.history.t_ns[run.history.step[rows.min()]]) * 1e-9
+    return run.history.at_s(run.history.step[rows.min()])
 
 
 def _elsewhere(h: History) -> Flags:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,14 +69,12 @@ class FilteredRun(NamedTuple):
     def of(self, where: Where) -> Ints:
         """Return the rows of a sensor that were judged."""
         h = self.run.history
-        return np.flatnonzero((h.robot[h.step] == where[0]) & (h.sensor == where[1]) & np.isfinite(h.d2))
+        return np.flatnonzero(h.made_by(*where) & np.isfinite(h.d2))
 
     def sensors(self) -> list[Where]:
         """Return the sensors of the state that made readings which were judged."""
         h = self.run.history
-        mine = h.of_own & np.isfinite(h.d2)
-        both = {*zip(h.robot[h.step[mine]].tolist(), h.sensor[mine].tolist(), strict=True)}
-        return sorted(both)
+        return sorted({*compress(h.sensor_keys(), h.of_own & np.isfinite(h.d2))})
 
     def tried(self) -> list[Where]:
         """Return the configured sensors, without detectors of rest."""

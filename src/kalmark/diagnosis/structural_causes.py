@@ -72,7 +72,7 @@ def _started_elsewhere(run: Run) -> Iterator[Cause]:
             _, evidence, cure = started_at(run.config, start, restart.onto, restart.agreed, restart.variance)
             evidence += f"; the map was moved onto them at t={restart.t_ns * 1e-9:.1f} s"
             first = run.history.fixes[: restart.fixes]
-            score = 0.5 * sum(float(fix.z @ np.linalg.solve(fix.Z, fix.z)) for fix in first)
+            score = 0.5 * sum(fix.d2 for fix in first)
             yield Cause("start", start.t_ns * 1e-9, score, evidence, cure, True)
 
 
@@ -110,7 +110,7 @@ def _lost(run: Run) -> Iterator[Cause]:
 def _left_out_until(run: Run, placed: Sequence[RelocatedRobot]) -> float:
     """Return half of the chi-square of the readings that moved a robot: those left out in a row until it was moved."""
     h, now, score = run.history, fit_of_run(run), 0.0
-    of = (h.robot[h.step] == placed[0].robot) & (h.sensor == placed[0].sensor)
+    of = h.made_by(placed[0].robot, placed[0].sensor)
     for one in placed:
         mine = np.flatnonzero(of & (h.t_ns[h.step] <= one.t_ns))
         used = np.flatnonzero(h.outcome[mine] != "rejected")
@@ -124,7 +124,7 @@ def _remapped_landmarks(run: Run) -> Iterator[Cause]:
     h = run.history
     for change in (c for c in h.changes if c.reason == BEGUN_AGAIN):
         rows = np.flatnonzero((h.id == change.landmark) & (h.step <= change.step))
-        now_s, begun_s = (float(h.t_ns[step]) * 1e-9 for step in (change.step, h.step[rows].min(initial=change.step)))
+        now_s, begun_s = map(h.at_s, (change.step, h.step[rows].min(initial=change.step)))
         score, cure = 0.5 * MOST * len(rows), f"leave out its first observation, at t={begun_s:.1f} s"
         if (h.outcome[rows] != "rejected").sum() > 1:  # there, too, observations agreed
             told = f"landmark {change.landmark} was moved by t={now_s:.1f} s: from then on it is mapped there"
@@ -190,7 +190,7 @@ def unfitting_measurements(run: Run) -> list[Cause]:
     """
     h, found = run.history, []
     alone = (h.outcome == "tentative") & ~np.isin(h.landmark, h.landmark[h.fused])
-    of = [f"observations of {a}.{b}" for a, b in zip(h.robot[h.step], h.sensor, strict=True)]
+    of = [f"observations of {a}.{b}" for a, b in h.sensor_keys()]
     stream = np.array([*of, *(f"fixes of {fix.robot}" for fix in h.fixes)])
     out = np.array([*(alone | (h.outcome == "rejected")), *(not fix.used for fix in h.fixes)], dtype=np.bool_)
     for name in np.unique(stream):
@@ -215,9 +215,10 @@ def abandoned_surveys(run: Run) -> list[Cause]:
             chi2 = float(off @ np.linalg.pinv(P) @ off)
             sure = f"{figure(float(np.linalg.norm(off)))} m from its survey ({figure(float(np.sqrt(chi2)), 2)} sigma)"
             told = f"is {sure}: the filter left its survey out and mapped it at ({at}) m"
-        since_s = float(h.t_ns[change.step]) * 1e-9
         cure = f"correct {change.landmark} in the file of the survey, or leave it out"
-        found.append(Cause("landmark_prior", since_s, 0.5 * chi2, f"landmark {change.landmark} {told}", cure, True))
+        found.append(
+            Cause("landmark_prior", h.at_s(change.step), 0.5 * chi2, f"landmark {change.landmark} {told}", cure, True)
+        )
     return found
 
 

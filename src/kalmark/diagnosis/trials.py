@@ -111,10 +111,10 @@ def _likelihoods(h: History, dof: Ints, shrunk: Mapping[tuple[str, str], float])
     """
     stated = np.isfinite(h.noise).sum(axis=1)
     judged = np.isfinite(h.d2) & ((h.outcome == "associated") | h.of_own) & ((stated == 0) | (stated == dof))
-    robots, fits, anywhere = h.robot[h.step], np.where(judged, -0.5 * h.d2, -np.inf), -0.5 * MOST * dof
-    for robot, sensor, m in sorted({*zip(robots.tolist(), h.sensor.tolist(), stated.tolist(), strict=True)}):
-        rows = np.flatnonzero((robots == robot) & (h.sensor == sensor) & (stated == m))
-        by, sigma = shrunk.get((robot, sensor), 0.0), np.log(np.maximum(h.noise[rows, :m], TINY))
+    fits, anywhere = np.where(judged, -0.5 * h.d2, -np.inf), -0.5 * MOST * dof
+    for key, m in sorted({*zip(h.sensor_keys(), stated.tolist(), strict=True)}):
+        rows = np.flatnonzero(h.made_by(*key) & (stated == m))
+        by, sigma = shrunk.get(key, 0.0), np.log(np.maximum(h.noise[rows, :m], TINY))
         if m and h.y.shape[1] >= m:
             span = np.log(np.maximum(np.ptp(np.nan_to_num(h.y[rows, :m]), axis=0), TINY)) - LOG_PEAK
             anywhere[rows] = -np.maximum(span, sigma + 1.0).sum(axis=1) - by

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import chain, compress
-from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from typing import Annotated, Any, NamedTuple, SupportsIndex, TypeVar, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -459,6 +459,10 @@ class History:
     def t_s(self) -> Array:
         """The times (S,) of the steps in seconds since the first."""
         return (self.t_ns - self.t_ns[:1].sum()) * 1e-9
+
+    def at_s(self, step: SupportsIndex) -> float:
+        """Return the time of a step, s of the log."""
+        return float(self.t_ns[step]) * 1e-9
 
     @property
     def robots(self) -> tuple[str, ...]:
