@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 
 from kalmark.config.data_sheets import take_data_sheets
 from kalmark.config.schema import Config
-from kalmark.config.tree import KeyPath, Tree, folder_beside, quote_value, read_tree
+from kalmark.config.tree import KeyPath, Tree, folder_beside, quote_value, read_tree, value_at
 from kalmark.declare import classes, load_plugin
 from kalmark.errors import ConfigError, KalmarkError
 
@@ -141,11 +141,11 @@ def _one_error(path: KeyPath, error: ErrorDetails, tree: Tree) -> ConfigError:
     if kind == "unknown_key":
         key, keys = str(context["key"]), context["keys"]
         path = (*path, key)
-        value = _at(tree.values, path)
+        value = value_at(tree.values, path)
         near = did_you_mean(key, keys)
         message = f"got {context['what']} (value {quote_value(value)}), expected {_one_of(keys)}{near}"
         return ConfigError(f"{tree.place(path, of_key=True)}: {'.'.join(path)}: {message}")
-    value = _at(tree.values, path)
+    value = value_at(tree.values, path)
     if kind == "union_tag_invalid":
         path, got = (path, value) if isinstance(value, str) else ((*path, "type"), value.get("type"))
         message = _not_one_of(got, context["types"], path) + context["missing"]
@@ -155,7 +155,7 @@ def _one_error(path: KeyPath, error: ErrorDetails, tree: Tree) -> ConfigError:
         names = f": {_one_of(context['types'])}" if "types" in context else ""
         message = f"got {quote_value(value)}, expected a mapping with a type{names}"
         if _kind(path) == "sensor":
-            others = [name for name in _at(tree.values, path[:-1]) if name != path[-1]]
+            others = [name for name in value_at(tree.values, path[:-1]) if name != path[-1]]
             message += did_you_mean(path[-1], others).replace("mean ", "mean the sensor ")
     else:
         message = f"got {quote_value(value)}, expected {_expected(kind, context, error['msg'])}"
@@ -172,15 +172,6 @@ def _path(loc: tuple[int | str, ...], values: Any) -> KeyPath:
             node = node[part]
             path = (*path, str(part))
     return path
-
-
-def _at(values: Any, path: KeyPath) -> Any:
-    for part in path:
-        if isinstance(values, dict):
-            values = values.get(part)
-        else:
-            values = values[int(part)] if isinstance(values, list) and part.isdecimal() else None
-    return values
 
 
 def _expected(kind: str, context: dict[str, Any], message: str) -> str:

@@ -65,6 +65,30 @@ class Tree:
                 table.setdefault((*path, name, *p[len(path) + 1 :]), table[p])
 
 
+def value_at(values: Any, path: Sequence[str]) -> Any:
+    """Return the value at a path of keys, or of indices of lists; None if there is none."""
+    for key in path:
+        if isinstance(values, list):
+            values = {str(k): value for k, value in enumerate(values)}
+        values = values.get(key) if isinstance(values, Mapping) else None
+    return values
+
+
+def put(values: Any, path: Sequence[str], value: Any) -> Any:
+    """Put a value at a path of a mapping, where mappings that are missing are made, and return the one that has it."""
+    for key in path[:-1]:
+        if not isinstance(values.get(key), Mapping):
+            values[key] = type(values)()
+        values = values[key]
+    values[path[-1]] = value
+    return values
+
+
+def robot_section(config: Mapping[str, Any], robot: str) -> str:
+    """Return the name of the section of a robot: its own, or that of all robots without one."""
+    return EACH if value_at(config, ("robots", robot)) is None else robot
+
+
 def place_around(places: Mapping[KeyPath, str], path: KeyPath) -> str:
     """Return the place of the value at `path`, or of the nearest thing around it, "" if none is known."""
     return next((places[path[:n]] for n in range(len(path), -1, -1) if path[:n] in places), "")

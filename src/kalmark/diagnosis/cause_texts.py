@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.batch.motion_chain import TURNING
+from kalmark.config.tree import EACH, value_at
 from kalmark.diagnosis.causes import TIMES, Finding
 from kalmark.diagnosis.error_columns import ALL, ALSO
 from kalmark.diagnosis.jumps import LISTED, OddControl, step_size
@@ -95,14 +96,8 @@ def _size(value: float, unit: str) -> str:
 
 def _current(config: Mapping[str, Any], robot: str, *path: str) -> Any:
     """Return a value of a robot's section, None where the configuration does not state it."""
-    robots = config.get("robots") or {}
-    for name in (robot, "each"):
-        section: Any = robots.get(name)
-        for key in path:
-            section = section.get(key) if isinstance(section, Mapping) else None
-        if section is not None:
-            return section
-    return None
+    stated = (value_at(config, ("robots", name, *path)) for name in (robot, EACH))
+    return next((value for value in stated if value is not None), None)
 
 
 def _set(robot: str, path: str, value: float) -> str:
@@ -111,9 +106,7 @@ def _set(robot: str, path: str, value: float) -> str:
 
 def log_correction_line(config: Mapping[str, Any], option: str, path: tuple[str, ...], by: float) -> str:
     """Return the line that adds to the times of a sensor (`shift_s`), or multiplies a column (`factors`), of a log."""
-    now = (config.get("log") or {}).get(option)
-    for name in path:
-        now = now.get(name) if isinstance(now, Mapping) else None
+    now = value_at(config, ("log", option, *path))
     neutral = 0.0 if option == "shift_s" else 1.0
     old = now if isinstance(now, float | int) else neutral
     return f"--set log.{option}.{'.'.join(path)}={figure(old + by if option == 'shift_s' else old * by, 6)}"

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.config.tree import robot_section, value_at
 from kalmark.diagnosis.mistakes import Mistake, late_scans, mistakes, with_value
 from kalmark.diagnosis.single_ids import OUTLIERS, Filtered, find_wrong_ids, gated
 from kalmark.diagnosis.trials import (
@@ -217,7 +218,6 @@ def started_at(
     It is as uncertain as `fixes` (N, d) of a variance leave it.
     """
     before = start.mean[: 3 if len(onto.shift) == 2 else 7]
-    robots = config.get("robots") or {}
     moved = onto.poses(before[None])[0]
     sigma_m, sigma_rad = level_sigmas(fixes, variance, moved[: len(onto.shift)])
     if len(onto.shift) == 2:
@@ -225,7 +225,7 @@ def started_at(
     else:
         sigmas = {"sigma_position_m": sigma_m, "sigma_rotation_deg": [0.0, 0.0, math.degrees(sigma_rad)]}
     was, now = _as_stated(before), _as_stated(moved)
-    section = robots.get(start.robot, robots.get("each")) or {}
+    section = value_at(config, ("robots", robot_section(config, start.robot))) or {}
     stated = {**(section.get("start") or {}), **now, **sigmas}
     changed = with_value(config, ("robots", start.robot), {**section, "start": stated})
     evidence = f"{start.robot} starts {_at(now)}, not {_at(was)}: then its path fits its fixes"

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.config.tree import put, robot_section, value_at
 from kalmark.diagnosis.cause_texts import RANGE, log_correction_line
 from kalmark.diagnosis.error_columns import ALL
 from kalmark.events import Control, Event, Scan
@@ -153,7 +154,7 @@ def _of_mounts(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
         camera = any(name.endswith("_px") for name in names)
         looks = mount.detector is not None or names[:2] == ("x_m", "y_m")
         if camera:
-            now = configured_value(config, (*at, sensor, "mount")) or {}
+            now = value_at(config, (*at, sensor, "mount")) or {}
             if space and not any(now.get(name) for name in ("roll_deg", "pitch_deg", "yaw_deg")):
                 key = f"robots.{robot.name}.sensors.{sensor}.mount"
                 evidence = f"{robot.name}.{sensor} fits only with its optical axis forward: its mount lacks that turn"
@@ -172,7 +173,7 @@ def _of_ranges(config: Mapping[str, Any], robot: Robot) -> Iterator[Mistake]:
     for sensor in (name for name, mount in robot.sensors.items() if tuple(mount.sensor.columns) == (RANGE,)):
         path, of = ("robots", robot_section(config, robot.name), "sensors", sensor), f"{robot.name}.{sensor}"
         key = f"robots.{robot.name}.sensors.{sensor}"
-        bias_m = float(configured_value(config, (*path, "bias_m")) or 0.0)
+        bias_m = float(value_at(config, (*path, "bias_m")) or 0.0)
         for offset_m in OFFSETS_M:
             evidence = f"ranges of {of} are {abs(offset_m):g} m too {'long' if offset_m > 0 else 'short'}"
             cure = f"--set {key}.bias_m={bias_m + offset_m:g}"
@@ -192,7 +193,7 @@ def _turned(config: Mapping[str, Any], robot: str, sensors: list[str], turn: int
     of = f"the sensor {robot}.{sensors[0]} looks" if len(sensors) == 1 else f"{' and '.join(sensors)} of {robot} look"
     for sensor in sensors:
         path = ("robots", robot_section(config, robot), "sensors", sensor, "mount", name)
-        old = float(configured_value(config, path) or 0.0)
+        old = float(value_at(config, path) or 0.0)
         angle = math.remainder(old + turn, 360.0) if space else math.remainder(old + turn * DEGREE, 2 * math.pi)
         config = with_value(config, path, angle)
         cures.append(f"--set robots.{robot}.sensors.{sensor}.mount.{name}={angle:.4f}")
@@ -239,28 +240,10 @@ def late_scans(config: Mapping[str, Any], robot: str, by_s: float) -> Mistake:
 
 
 # ------------------------------------------------------------------ configurations and events without them
-def robot_section(config: Mapping[str, Any], robot: str) -> str:
-    """Return the name of the section of a robot."""
-    return robot if robot in config["robots"] else "each"
-
-
-def configured_value(config: Mapping[str, Any], path: tuple[str, ...]) -> Any:
-    """Return the value of a configuration at a path, None for none."""
-    section: Any = config
-    for key in path:
-        section = section.get(key) if isinstance(section, Mapping) else None
-    return section
-
-
 def with_value(config: Mapping[str, Any], path: tuple[str, ...], value: Any) -> dict[str, Any]:
     """Return a configuration with another value at a path."""
     changed = deepcopy(dict(config))
-    section: Any = changed
-    for key in path[:-1]:
-        if section.get(key) is None:
-            section[key] = {}
-        section = section[key]
-    section[path[-1]] = value
+    section = put(changed, path, value)
     if path[-1].startswith("sigma_"):
         section.pop("cov", None)  # of a mount or a start: its sigmas as they were
     return changed

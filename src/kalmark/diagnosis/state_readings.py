@@ -16,9 +16,10 @@ import numpy as np
 from scipy.special import chdtri
 
 from kalmark.arrays import Array
+from kalmark.config.tree import robot_section, value_at
 from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.diagnosis.causes import LEAST_GAIN
-from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, configured_value, robot_section, with_value
+from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, with_value
 from kalmark.diagnosis.trials import (
     FITS,
     MISFIT,
@@ -163,9 +164,7 @@ class _Sensor:
     def noise(self) -> Mistake | None:
         """Return a trial with more noise than stated: by the factor at which the innovations fit their covariance."""
         keys = [
-            k
-            for k in dict.fromkeys(self.sensor.sigmas)
-            if isinstance(configured_value(self.config, (*self.path, k)), float)
+            k for k in dict.fromkeys(self.sensor.sigmas) if isinstance(value_at(self.config, (*self.path, k)), float)
         ]
         if not keys:
             return None
@@ -178,7 +177,7 @@ class _Sensor:
             times *= step
             config = self.config
             for k in keys:
-                config = with_value(config, (*self.path, k), configured_value(self.config, (*self.path, k)) * times)
+                config = with_value(config, (*self.path, k), value_at(self.config, (*self.path, k)) * times)
             found = filtered_with(self.engine, config, self.log, self.events)
             if found is None:
                 return None
@@ -186,25 +185,25 @@ class _Sensor:
             if abs(step - 1.0) < SAME:
                 break
         what = f"readings of {'.'.join(self.where)} fit if their noise is {figure(times, 2)} times as large as stated"
-        cure = " ".join(self.cured(k, configured_value(config, (*self.path, k))) for k in keys)
+        cure = " ".join(self.cured(k, value_at(config, (*self.path, k))) for k in keys)
         gain = self.gain(now)
         return Mistake(SIGMA, what, cure, config, gain=gain) if gain > LEAST_GAIN else None
 
     def constants(self) -> Iterator[Mistake | None]:
         """Yield that a constant of it is not as stated, or its mount: each as the filter finds it."""
         constants = [*self.sensor.constants]
-        if configured_value(self.config, (*self.path, SIGMA_SCALE)) is not None:
+        if value_at(self.config, (*self.path, SIGMA_SCALE)) is not None:
             constants.append(("scale", SIGMA_SCALE, ""))
         for key in dict.fromkeys(key for _, key, _ in constants if key):
             names = [name for name, of, _ in constants if of == key]
             sigma = {"scale": MOST_SCALE, "declination_rad": math.pi}.get(names[0], WIDER * self.size)
-            if float(configured_value(self.config, (*self.path, key)) or 0.0) * WIDER < sigma:
+            if float(value_at(self.config, (*self.path, key)) or 0.0) * WIDER < sigma:
                 yield self.in_map(SCALE if names == ["scale"] else CONSTANT, (key,), sigma, names)
         if self.sensor.views == POSE and self.sensor.columns[0] == "x_m":
             key = "sigma_position_m" if self.space else "sigma_xy_m"
             names = ["x_m", "y_m", "z_m"] if self.space else ["x_m", "y_m"]
             sigma = WIDER * self.size
-            if float(np.max(configured_value(self.config, (*self.path, "mount", key)) or 0.0)) * WIDER < sigma:
+            if float(np.max(value_at(self.config, (*self.path, "mount", key)) or 0.0)) * WIDER < sigma:
                 yield self.in_map(ARM, ("mount", key), sigma, names)
 
     def in_map(
@@ -216,7 +215,7 @@ class _Sensor:
 
         def told(after: FilteredRun) -> tuple[str, str]:
             found = {m.name: mount_figures(m) for m in after.run.history.mounts}[".".join(self.where)]
-            old = [float(configured_value(self.config, (*self.path, *path, n)) or (n == "scale")) for n in names]
+            old = [float(value_at(self.config, (*self.path, *path, n)) or (n == "scale")) for n in names]
             values = [
                 f"{n} {figure(found[n])} ± {figure(found[f'sigma_{n}'], 2)} instead of {figure(o)}"
                 for n, o in zip(names, old, strict=True)

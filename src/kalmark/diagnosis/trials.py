@@ -20,9 +20,9 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.config import build_slam
 from kalmark.config.reading import config_of
-from kalmark.config.tree import Tree, parse_value
+from kalmark.config.tree import Plain, Tree, parse_value, put, robot_section, value_at
 from kalmark.diagnosis.cause_texts import OR
-from kalmark.diagnosis.mistakes import Mistake, Where, configured_value, robot_section, with_value
+from kalmark.diagnosis.mistakes import Mistake, Where, with_value
 from kalmark.errors import KalmarkError, LogError
 from kalmark.events import Event, Frame, Raw, Scan, sort_key
 from kalmark.logs.log import Log
@@ -349,8 +349,9 @@ def with_cure(config: Mapping[str, Any], log: Log, cure: str) -> tuple[dict[str,
         path, _, text = option.partition("=")
         names, value = tuple(path.split(".")), parse_value(text, "cure")
         if names[0] == "log":
-            is_factor, now = names[1] == "factors", configured_value(config, names)
-            by = _nested(names[2:], value / (now or 1.0) if is_factor else value - (now or 0.0))
+            is_factor, now = names[1] == "factors", value_at(config, names)
+            by: Plain = {}
+            put(by, names[2:], value / (now or 1.0) if is_factor else value - (now or 0.0))
             try:
                 read = correct_log(read, *((by, None) if is_factor else (None, by)))
             except LogError:
@@ -377,9 +378,5 @@ def is_configured(config: Mapping[str, Any], cure: str) -> bool:
     options = [option.partition("=") for option in options_of(cure)]
     paths = [path.split(".") for path, _, _ in options]
     at = [(names[0], robot_section(config, names[1]), *names[2:]) if names[0] == "robots" else names for names in paths]
-    now = [configured_value(config, tuple(names)) for names in at]
+    now = [value_at(config, names) for names in at]
     return bool(now) and now == [parse_value(text, "cure") for _, _, text in options]
-
-
-def _nested(names: Sequence[str], value: float) -> dict[str, Any]:
-    return {names[0]: _nested(names[1:], value) if len(names) > 1 else value}

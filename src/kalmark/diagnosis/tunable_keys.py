@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kalmark.config.tree import EACH
+from kalmark.config.tree import EACH, put, robot_section, value_at
 from kalmark.diagnosis.components import Noise
 from kalmark.diagnosis.error_columns import Column
 from kalmark.results.run import Run
@@ -33,10 +33,7 @@ class Keys:
         content = deepcopy(self.config)
         for path, value in values.items():
             for owner in self._owners(path):
-                node = content
-                for key in owner[:-1]:
-                    node = node.setdefault(key, {})
-                node[owner[-1]] = value
+                put(content, owner, value)
         return content
 
     def _owners(self, path: Path_) -> list[Path_]:
@@ -89,7 +86,7 @@ class Keys:
         if column.name not in CALIBRATIONS:
             return None
         robot, sensor = column.of[:2]
-        path: Path_ = ("robots", self.section(robot if robot in self.config["robots"] else EACH), "sensors", sensor)
+        path: Path_ = ("robots", self.section(robot_section(self.config, robot)), "sensors", sensor)
         section = run.section(robot, sensor)
         mount = section.get("mount") or {}
         in_map = any(section.get(key) for key in ("sigma_scale", "sigma_bias_m"))
@@ -100,7 +97,4 @@ class Keys:
 
     def stated(self, path: Path_) -> Any:
         """Return the value of a key as it is in force."""
-        node: Any = self.config
-        for key in self._owners(path)[0]:
-            node = node.get(key) if isinstance(node, Mapping) else None
-        return node
+        return value_at(self.config, self._owners(path)[0])

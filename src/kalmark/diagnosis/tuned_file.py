@@ -13,7 +13,7 @@ from ruamel.yaml.scalarfloat import ScalarFloat
 
 from kalmark.config.opening import find_log
 from kalmark.config.reading import load_config, resolve_config, shipped_configs
-from kalmark.config.tree import parse_value
+from kalmark.config.tree import parse_value, put, value_at
 from kalmark.diagnosis.tune import AIMS, Change, Tuning
 from kalmark.results.figure_texts import figure
 
@@ -51,24 +51,19 @@ def new_config(config: str | Path, tuning: Tuning, overrides: Sequence[str] = ()
     return _head(source, tuning) + dumped.getvalue()
 
 
-def _put(content: CommentedMap, path: Sequence[str], value: Any) -> CommentedMap:
+def _put(content: CommentedMap, path: Sequence[str], value: Any) -> Any:
     """Put a value where it belongs, and return the mapping that has it.  Another type replaces its section."""
-    owner = content
-    for key in path[:-1]:
-        if not isinstance(owner.get(key), CommentedMap):
-            owner[key] = CommentedMap()
-        owner = owner[key]
-    if path[-1] == "type" and owner.get("type", value) != value:
-        for key in [key for key in owner if key != "mount"]:
-            del owner[key]
-    owner[path[-1]] = float(value) if isinstance(value, ScalarFloat) else value
-    return owner
+    if path[-1] == "type" and (value_at(content, path) or value) != value:
+        section = value_at(content, path[:-1])
+        for key in [key for key in section if key != "mount"]:
+            del section[key]
+    return put(content, path, float(value) if isinstance(value, ScalarFloat) else value)
 
 
-def _note(owner: CommentedMap, change: Change) -> None:
+def _note(owner: Any, change: Change) -> None:
     """Add the comment that a value was tuned, before its old comment."""
     key, told = change.path[-1], f"tuned, was {_text(change.before)}"
-    if owner.fa.flow_style():
+    if not isinstance(owner, CommentedMap) or owner.fa.flow_style():
         return  # a comment would end the line of a mapping in braces; the head of the file has it
     token = (owner.ca.items.get(key) or [None] * 4)[2]
     if token is None:
