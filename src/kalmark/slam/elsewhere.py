@@ -308,15 +308,14 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
         A.append(np.hstack([np.eye(space.dof, d), space.generator(l)]))
     ends = np.cumsum([0, *(len(part) for part in A)])
     G = np.split(np.linalg.pinv(np.concatenate(A)), ends[1:-1], axis=1)
-    sizes = (*(len(state.map.rows(one)) for one in own), *(len(A[fits.index(name)]) for name in mapped))
-    rows = state.rows((*zip((*own, *(tracks.slots[name] for name in mapped)), sizes, strict=True),))
-    F, Q = np.eye(len(rows)), np.zeros((len(rows), len(rows)))
+    of_map = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] for name in mapped)])
+    n = len(cov) + of_map.shape[1]
+    F, Q = np.eye(n), np.zeros((n, n))
     F[: len(cov)], Q[: len(cov), : len(cov)] = 0.0, cov
-    F[:dof, len(cov) :] = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] for name in mapped)])
+    F[:dof, len(cov) :] = of_map
     of.weigh(_mapped_again(state, scan, before, after, cov))
-    state.map.predict(rows, F, Q)
-    for one in own:
-        state.map.set_predicted(one, other.map.mean(one))
+    moved = [*own, *(tracks.slots[name] for name in mapped)]
+    state.move_blocks(moved, F, Q, map(other.map.mean, own))
     for name in _young(state, robot, of):
         state.remove(name)
         scan.report.removed += ((name, MEANWHILE),)

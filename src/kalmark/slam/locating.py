@@ -242,9 +242,7 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     mounts += [reader.mount for (robot, _), reader in state.readers.items() if robot == name]
     slots = [moving.slot, *(slot for slot in (moving.bias, *mounts) if slot is not None and slot >= 0)]
     means, cov = sum_.moments(slots)
-    state.map.predict(state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots)), np.zeros_like(cov), cov)
-    for slot, mean in zip(slots, means, strict=True):
-        state.map.set_predicted(slot, mean)
+    state.move_blocks(slots, np.zeros_like(cov), cov, means)
     state.clones.forget_current(name)
 
 

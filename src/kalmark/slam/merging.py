@@ -128,11 +128,8 @@ def _displace(state: State, scan: ScanContext, repeat: Repeat) -> bool:
         slots += [scan.robot, *(track.slot for track in state.tracks.tentative.values())]
         slots += [clone.slot for clone in state.clones.clones.values()]
     means, F, Q = of_map.displacement(state.map, slots, repeat)
-    rows, before = state.rows(tuple((slot, len(state.map.rows(slot))) for slot in slots)), state.map.mean(scan.robot)
-    state.map.predict(rows, F, Q)
-    for slot, mean in zip(slots, means, strict=True):
-        state.map.set_predicted(slot, mean)
-    of = state.evidence.get(scan.event.robot)
+    before, of = state.map.mean(scan.robot), state.evidence.get(scan.event.robot)
+    state.move_blocks(slots, F, Q, means)
     if inside and of is not None:
         since_ns = min(state.begun_ns(name) for name in repeat.newer)
         elsewhere.report_found(state, scan, since_ns, before)

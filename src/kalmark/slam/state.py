@@ -205,6 +205,12 @@ class State:
             self.map.index(slot)  # to activate a block may move those that are active
         return np.concatenate([self.map.index(slot)[:count] for slot, count in parts])
 
+    def move_blocks(self, slots: Sequence[int], F: Array, Q: Array, means: Iterable[Array] = ()) -> None:
+        """Move blocks, the first of them to new means: of all their rows together P <- F P F' + Q."""
+        self.map.predict(self.rows(tuple((slot, len(self.map.rows(slot))) for slot in slots)), F, Q)
+        for slot, mean in zip(slots, means, strict=False):
+            self.map.set_predicted(slot, mean)
+
     def add(self, start: Start) -> int:
         """Add a block computed from others; return its slot.  Raises MapError where the map is full.  [S] (35)-(38)."""
         return self.map.augment(start.space, start.mean, self.rows(start.parts), start.G, start.Q)
@@ -300,8 +306,7 @@ class State:
         slots = [*self.tracks.slots.values()]
         P = self.map.covariance(slots)
         cov = check_covariance(cov, len(P), "cov of all that is in the map", definite=False, error=MapError)
-        parts = tuple((slot, len(self.map.rows(slot))) for slot in slots)
-        self.map.predict(self.rows(parts), np.eye(len(P)), cov - P)
+        self.move_blocks(slots, np.eye(len(P)), cov - P)
 
     def is_surveyed(self, name: Id) -> bool:
         """Return whether a landmark was given, and not mapped from here."""
