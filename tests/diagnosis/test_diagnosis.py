@@ -647,7 +647,7 @@ def test_what_is_left_of_data_is_their_projection_in_textbook_form() -> None:
     z, e = rng.normal(size=n), rng.normal(size=linear.root.shape[1])
     left = linear.left(z, linear.root @ e)
     # textbook: the white errors e and the data z by generalised least squares, motion as constraints of J dx = root e
-    H, J, Q = linear.at.H.toarray(), linear.at.J.toarray(), (linear.root @ linear.root.T).toarray()
+    H, J, Q = linear.at.H.toarray(), linear.at.J.toarray(), linear.Q.toarray()
     free = problem.free
     kkt = np.block([[H.T @ H, J.T], [J, -Q]])[:, np.r_[free, np.ones(q, bool)]][np.r_[free, np.ones(q, bool)]]
     rhs = np.concatenate([(H.T @ z)[free], -(linear.root @ e)])

@@ -110,8 +110,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
     Z, W = stacked(columns)
     have, left = linear.residuals, linear.left(Z, W)
     g, I = Z.T @ have.r + W.T @ have.m, np.sum(Z * left.r, axis=0) + np.sum(W * left.m, axis=0)
-    (block, motion), Q, found = _blocks(linear), linear.root @ linear.root.T, []
-    n = len(linear.problem.robots)
+    n, found = len(linear.problem.robots), []
     for k, column in enumerate(columns):
         if not LEAST_INFORMATION * (Z[:, k] @ Z[:, k] + 1.0) < I[k] < math.inf:
             continue
@@ -119,8 +118,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
         moves = 0.0 if Z[:, k].any() else np.abs(s * W[:, k]).reshape(n, -1)[:, : linear.state.d].max(initial=0.0)
         if abs(s) > column.most or moves > linear.step:
             continue  # no small error: the problem is not linear so far away
-        parts = np.bincount(block, left.r[:, k] * (have.r - s * left.r[:, k]), minlength=BLOCKS)
-        parts += np.bincount(motion, left.m[:, k] * (Q @ (have.m - s * left.m[:, k])), minlength=BLOCKS)
+        parts = stretches(linear, Left(left.r[:, [k]], left.m[:, [k]]), np.array([s]))[0]
         sigma = float(np.sqrt(max(I[k], float(parts @ parts))) / I[k])
         t2 = (s / sigma) ** 2
         found.append(
@@ -141,11 +139,8 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
 
 def joint_errors(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
     """Return the systematic errors s (K,), all at once and within their limits, and their information (K, K)."""
-    Z, W = stacked(columns)
-    have, left = linear.residuals, linear.left(Z, W)
-    I = Z.T @ left.r + W.T @ left.m
-    prior = np.diag([c.most**-2 for c in columns])
-    s = np.linalg.lstsq(I + prior, Z.T @ have.r + W.T @ have.m)[0]
+    g, I, _ = linear.scores(*stacked(columns))
+    s = np.linalg.lstsq(I + np.diag([c.most**-2 for c in columns]), g)[0]
     return np.asarray(s, dtype=np.float64), np.asarray(I, dtype=np.float64)
 
 
@@ -154,9 +149,9 @@ def stretches(linear: Linear, left: Left, s: Array) -> Array:
 
     `left` is what the state leaves of one unit of each.
     """
-    (block, motion), Q, have = _blocks(linear), linear.root @ linear.root.T, linear.residuals
+    (block, motion), have = _blocks(linear), linear.residuals
     rows = left.r * (have.r - left.r @ s)[:, None]
-    moves = left.m * (Q @ (have.m - left.m @ s))[:, None]
+    moves = left.m * (linear.Q @ (have.m - left.m @ s))[:, None]
     parts = [
         np.bincount(block, r, BLOCKS) + np.bincount(motion, m, BLOCKS) for r, m in zip(rows.T, moves.T, strict=True)
     ]
@@ -177,8 +172,8 @@ def noise(linear: Linear, simulated: Left, sensors: Mapping[Where, tuple[str, ..
     Variance components: the sum of squares of what is left of a group, over what it is in data as configured.
     """
     rows, factors, found = linear.rows, linear.problem.factors, []
-    have, Q = linear.residuals, linear.root @ linear.root.T
-    most = 0.5 * float(have.r @ have.r + have.m @ (Q @ have.m))  # is all that a noise can explain
+    have = linear.residuals
+    most = 0.5 * float(have.r @ have.r + have.m @ (linear.Q @ have.m))  # is all that a noise can explain
     r2, simulated2 = linear.residuals.r**2, simulated.r**2
     for f, factor in enumerate(factors):
         names = sensors.get(factor.sensor, ())

@@ -92,6 +92,11 @@ class Linear:
         return sp.csr_array(self.problem.motions.root @ sp.diags_array(self.errors))
 
     @cached_property
+    def Q(self) -> sp.csr_array:
+        """The covariance (q n, q n) of the motion's errors."""
+        return sp.csr_array(self.root @ self.root.T)
+
+    @cached_property
     def at(self) -> Linearized:
         """Residuals and Jacobians, whitened by the noise."""
         H = sp.csr_array(sp.diags_array(1.0 / self.noise) @ self.base.H)
@@ -175,6 +180,11 @@ class Linear:
         """Return the residuals of data z (N, ...), w (q n, ...)."""
         step, m = self.reduced.solved(z, w)
         return Left(z - self.at.H @ step, m)
+
+    def scores(self, Z: Array, W: Array) -> tuple[Array, Array, Left]:
+        """Return the scores (K,) of errors Z (N, K), W (q n, K), their information (K, K), and what is left of them."""
+        have, left = self.residuals, self.left(Z, W)
+        return Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m, left
 
     @cached_property
     def residuals(self) -> Left:
