@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -252,31 +252,29 @@ def _jump(finding: Finding) -> str:
     return f"{figure(far_m)} m and {figure(turn_deg)} deg ({figure(finding.value, 2)} sigma)"
 
 
-def _others(finding: Finding) -> str:
+def _others(times: Sequence[str]) -> str:
     """Return the times of the other jumps of a robot."""
-    times = finding.of[2:]
     some = ", ".join(times[:LISTED])
     return f"; {len(times)} more at t={some} s{', ...' if len(times) > LISTED else ''}" if times else ""
 
 
 def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
     far = f"{finding.of[0]} is moved by about {_jump(finding)} at t={finding.of[1]} s"
-    return f"{far}, and its controls do not show it{_others(finding)}", ""
+    return f"{far}, and its controls do not show it{_others(finding.of[2:])}", ""
 
 
 def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
     by = f"{finding.of[0]} moves by {_jump(finding)} more than by its controls at t={finding.of[1]} s"
-    return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding)}", ""
+    return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding.of[2:])}", ""
 
 
-def odd_control_text(finding: Finding, odd: OddControl) -> Words:
-    """Return a sentence about a control that jumps, and the limit that leaves it out, where its column has one."""
-    robot = finding.of[0]
+def odd_control_text(robot: str, odd: OddControl, times: Sequence[str] = ()) -> Words:
+    """Return a sentence about a control that jumps, also at `times`, and the limit of its column that leaves it out."""
     degrees = odd.column.endswith(("_rad", "_radps"))
     value = f"{figure(math.degrees(odd.value) if degrees else odd.value)} {'deg' if degrees else ''}".rstrip()
     evidence = (
         f"{odd.column} of {robot} is {value} at t={odd.t_s:.1f} s, {figure(odd.times, 2)} times as large as is usual,"
-        f" and it does not move so: its odometry jumps{_others(finding)}"
+        f" and it does not move so: its odometry jumps{_others(times)}"
     )
     key = LIMITS.get(odd.column)
     return (

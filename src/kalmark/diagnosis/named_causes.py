@@ -116,7 +116,7 @@ def cause_of(run: Run, finding: Finding, log: Log | None) -> Cause:
         more = "a scan between two increments counts at the end of the first, which may be why"
         told = f"{told[0]}; {more}", told[1]
     if odd is not None:
-        name, told = JUMP, odd_control_text(finding, odd)
+        name, told = JUMP, odd_control_text(finding.of[0], odd, finding.of[2:])
     if finding.begins:
         end_s = begin_s(run) + finding.until_s
         told = f"from t={since_s:.1f} {'s on' if end_s == math.inf else f'to {end_s:.1f} s'} {told[0]}", ""
@@ -141,9 +141,8 @@ def odd_controls(run: Run, log: Log) -> Iterator[Cause]:
         if odd:
             most, _ = max(odd.values(), key=lambda of: of[0].times)
             at = [f"{t_s:.1f}" for t_s in sorted(odd) if t_s != most.t_s]
-            finding = Finding(JUMP, (robot, "", *at), 0.0, 0.0, 0.0)
             score = 0.5 * float(sum(chi2[k] for _, k in odd.values()))
-            yield Cause(JUMP, min(odd), score, *odd_control_text(finding, most))
+            yield Cause(JUMP, min(odd), score, *odd_control_text(robot, most, at))
 
 
 def is_misplaced_survey(run: Run, finding: Finding) -> bool:

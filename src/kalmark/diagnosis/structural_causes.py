@@ -12,7 +12,6 @@ from scipy.special import pdtrc
 
 from kalmark.diagnosis import doubled_landmarks, repeated_events
 from kalmark.diagnosis.cause_texts import odd_control_text
-from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.effect import FEW
 from kalmark.diagnosis.gross_mistakes import started_at
 from kalmark.diagnosis.jumps import LISTED
@@ -250,11 +249,7 @@ def _carried(run: Run, log: Log) -> Iterator[Cause]:
             odd = controls_of(run, log, gap["robot"]).odd(since_s, gap["end_s"] - since_s)
             name = "start" if since_s <= begin_s(run) else "kidnapped"
             if odd is not None:
-                name, since_s, told = (
-                    JUMP,
-                    odd.t_s,
-                    odd_control_text(Finding(JUMP, (gap["robot"], ""), 0.0, 0.0, 0.0), odd),
-                )
+                name, since_s, told = JUMP, odd.t_s, odd_control_text(gap["robot"], odd)
             yield Cause(name, since_s, math.log(ODDS), *told, True)
 
 
@@ -305,7 +300,7 @@ def find_kidnaps(run: Run, log: Log) -> Iterator[Cause]:
     score = max(first.score, repeat["score"] if repeat and again else 0.0)
     odd = controls_of(run, log, first.robot).odd(first.t_s)
     if odd is not None:
-        yield Cause(JUMP, odd.t_s, score, *odd_control_text(Finding(JUMP, (first.robot, ""), 0.0, 0.0, 0.0), odd))
+        yield Cause(JUMP, odd.t_s, score, *odd_control_text(first.robot, odd))
         return
     yield Cause("kidnapped", first.t_s, score, evidence)
 
