@@ -22,7 +22,7 @@ def true_start(log: Log, name: str, motion: Motion) -> tuple[Array | None, Array
     """
     held = motion.held or coasts(motion)
     truth, begin = log.truth.get(name), begins_at(log.events, name, held)
-    if truth is None or begin is None or (len(truth.poses[0]) == 3) != (motion.space.world == "plane"):
+    if truth is None or begin is None or len(truth.poses[0]) != motion.space.pose.size:
         return None, None
     if np.isfinite(pose := truth.at(begin)).all():
         return pose, None

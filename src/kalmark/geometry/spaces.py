@@ -247,6 +247,16 @@ class Space:
         """Axes the world can turn about: 1 in the plane, 3 in space."""
         return 3 if self.world == "space" else 1
 
+    @property
+    def d(self) -> int:
+        """Dimensions of its world: 2 in the plane, 3 in space."""
+        return 3 if self.world == "space" else 2
+
+    @property
+    def pose(self) -> Space:
+        """The space of the poses of its world: `SE2` or `SE3`."""
+        return SE3 if self.world == "space" else SE2
+
     @cached_property
     def steps(self) -> bool:
         """True if a translation of the world moves it by what depends on its value."""

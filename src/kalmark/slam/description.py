@@ -163,7 +163,7 @@ def robot_described(name: str, said: Description, **own: Any) -> Robot:
     for key, each in said["sensors"].items():
         with part("sensors", key):
             model = model_described("sensor", each, space.world)
-            at, cov = place_described(each["mount"], 3 if space.world == "plane" else 6)
+            at, cov = place_described(each["mount"], space.pose.dof)
             sensors[key] = Mount(model, at=at, cov=cov, **_options(Mount, each, space.world))
     return Robot(name, sensors=sensors, **own)
 

@@ -163,7 +163,7 @@ class Estimate:
         """
         mean, P, model = self.mean(name), self.covariance(name), self.landmark_model(name)
         if model is None:
-            d = 2 if next(iter(self.robots.values())).motion.space.axes == 1 else 3
+            d = next(iter(self.robots.values())).motion.space.d
             return mean[:d], P[:d, :d]
         placed = place_of(model, mean[None])
         if placed is None:

@@ -212,7 +212,7 @@ def correct_by_factor(state: State, factor: BlockMeasurement, share: float) -> t
         return Observation(0, None, "rejected", names[0], d2, f"outside the gate of {limit:.2f}"), found
     moving = state.moving[next(iter([*robots, *state.robots]))]
     y = start.mean + factor.residual(factor.y, start.mean)
-    at = state.map.mean(moving.slot)[: 3 if moving.motion.space.axes == 1 else 7]
+    at = state.map.mean(moving.slot)[: moving.motion.space.pose.size]
     done = state.corrected_by([start], update_by_blocks(moving.slot, -1, at, y[None], factor.R[None]))
     outcome, reason = ("associated", "") if done.fused[0] else ("rejected", INDEFINITE)
     return Observation(0, None, outcome, names[0], d2, reason), found._replace(fused=done.fused)

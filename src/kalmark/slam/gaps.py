@@ -151,7 +151,7 @@ class Gaps:
         kind, start_ns = "held" if self.motion.held else "increments", self.last_ns
         if self.left_out_ns is not None:
             kind, start_ns = "ruled_out", self.left_out_ns
-        sigmas = np.sqrt(D.diagonal()[[0, 2 if self.motion.space.axes == 1 else 5]]).tolist()
+        sigmas = np.sqrt(D.diagonal()[[0, self.motion.space.pose.dof - 1]]).tolist()
         self.noticed = Gap(self.robot, kind, start_ns, t_ns, *sigmas)
         return D if D.any() else None
 
@@ -174,8 +174,7 @@ class Gaps:
         u = self.largest if self.motion.held else self.largest * self.usual_ns * 1e-9
         speed, turn = self._rates(u, self.usual_ns)
         speed, turn = self.max_speed_mps or MARGIN * speed, self.max_turn_radps or MARGIN * turn
-        d = 2 if space.axes == 1 else 3
-        D = np.zeros((space.dof, space.dof))
+        d, D = space.d, np.zeros((space.dof, space.dof))
         D[np.arange(d), np.arange(d)] = (speed * after_s) ** 2 / (d + 2)
         angles = np.arange(d, d + space.axes)
         D[angles, angles] = min(turn * after_s, math.pi) ** 2 / (space.axes + 2)
@@ -192,4 +191,4 @@ class Gaps:
             turned = abs(float(moved[2]))
         else:
             turned = 2.0 * math.atan2(float(np.linalg.norm(moved[3:6])), abs(float(moved[6])))
-        return float(np.linalg.norm(moved[: 2 if space.axes == 1 else 3])) / dt_s, turned / dt_s
+        return float(np.linalg.norm(moved[: space.d])) / dt_s, turned / dt_s

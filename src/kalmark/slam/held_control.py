@@ -292,7 +292,7 @@ class Moving:
     def note_speed(self, map_: Map) -> None:
         """Take note of how fast it is."""
         b = self.velocity(map_.mean(self.slot))[0]
-        d = 2 if self.motion.space.axes == 1 else 3
+        d = self.motion.space.d
         speeds = math.hypot(*b[:d].tolist()), math.hypot(*b[d:].tolist())
         self.fastest = max(self.fastest[0], speeds[0]), max(self.fastest[1], speeds[1])
 

@@ -77,7 +77,7 @@ class PoseHypothesis:
     def explains(self, t_ns: int) -> bool:
         """Return whether its readings have fitted for so long that they are right."""
         space = self.moving.motion.space
-        lasts_s = LASTS_S if space.dof == (3 if space.axes == 1 else 6) else LASTS_UNIT_S
+        lasts_s = LASTS_S if space.dof == space.pose.dof else LASTS_UNIT_S
         return (t_ns - self.since_ns) * 1e-9 >= lasts_s
 
     @property

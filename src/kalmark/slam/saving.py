@@ -26,7 +26,7 @@ from kalmark.events import Id
 from kalmark.files import refuse_bomb, replace_file
 from kalmark.filter.map import Map
 from kalmark.filter.maps import restore_map as restored_map
-from kalmark.geometry.spaces import SE2, SE3, Rn, Space
+from kalmark.geometry.spaces import Rn, Space
 from kalmark.management.hypotheses import POLAR
 from kalmark.models.protocols import Landmark
 from kalmark.slam.description import Description, arguments_of, describe, describe_model, model_described
@@ -230,8 +230,7 @@ def _owners(state: State) -> list[tuple[str, int, Space]]:
     owners += [(f"tentative {name!r}", t.slot, t.model.space) for name, t in tracks.tentative.items()]
     owners += [(f"a hypothesis of {p.name!r}", slot, POLAR) for p in tracks.waiting() for slot in p.hypotheses]
     for number, clone in state.clones.clones.items():
-        pose = SE2 if robots[clone.robot].motion.space.axes == 1 else SE3
-        owners.append((f"clone {number}", clone.slot, pose))
+        owners.append((f"clone {number}", clone.slot, robots[clone.robot].motion.space.pose))
     errors = [(name, m) for name, m in state.moving.items() if m.error is not None]
     owners += [(f"the error of {name!r}", m.error, Rn(len(m.motion.columns))) for name, m in errors]  # type: ignore[misc]
     return owners

@@ -17,7 +17,6 @@ from kalmark.filter.estimators import Correction, Estimator, Initializing, Selec
 from kalmark.filter.map import Map, StochasticMap
 from kalmark.filter.maps import MOST, CostBalance, compress_map, new_map
 from kalmark.geometry.pose_frames import ORIGIN
-from kalmark.geometry.spaces import SE2, SE3
 from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.protocols import Landmark, OfState, measures_blocks, world_of
 from kalmark.models.sensors import Gps2D, Gps3D
@@ -159,9 +158,10 @@ class State:
         moving = self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, held)
         if bias is not None and bias_slot is not None:
             moving.constants.append((bias_slot, *bias[1:]))
-        antenna, at = (Gps2D(), ORIGIN[3]) if robot.motion.space.axes == 1 else (Gps3D(), ORIGIN[7])  # of fixes
-        reader = self.antennas[robot.name] = StateReader(antenna, robot.motion, at, -1)
-        reader.gate = settings.association.threshold(len(antenna.columns), reader.gate)
+        world = robot.motion.space
+        reader = StateReader(ANTENNAS[world.d], robot.motion, ORIGIN[world.pose.size], -1)
+        reader.gate = settings.association.threshold(world.d, reader.gate)
+        self.antennas[robot.name] = reader
         for name, mount in robot.sensors.items():
             mount_slot, block = -1, mount.block(name)
             if block is not None:  # the mount calibrates itself
@@ -193,7 +193,7 @@ class State:
 
     def pose(self, name: str) -> Array:
         """Return the pose (3,) or (7,) of a robot."""
-        return self.map.mean(self.moving[name].slot)[: 3 if self.robots[name].motion.space.axes == 1 else 7]
+        return self.map.mean(self.moving[name].slot)[: self.robots[name].motion.space.pose.size]
 
     def view(self, key: ChannelKey) -> FilterView:
         """Return what the source of a channel reads."""
@@ -245,7 +245,7 @@ class State:
         """Clone the pose of a channel's robot; return the clone's number.  Raises MapError where the map is full."""
         number = self.clones.now(key[0], t_ns)
         if number is None:
-            robot, space = self.moving[key[0]].slot, SE2 if self.robots[key[0]].motion.space.axes == 1 else SE3
+            robot, space = self.moving[key[0]].slot, self.robots[key[0]].motion.space.pose
             mean, index, dof = self.map.mean(robot)[: space.size], self.map.index(robot)[: space.dof], space.dof
             slot = self.map.augment(space, mean, index, np.eye(dof), np.zeros((dof, dof)))
             number = self.clones.enter(slot, key[0], t_ns)
@@ -293,8 +293,8 @@ class State:
         if not given.take(y, ids) or given.chance() >= SELDOM:
             return False
         moving = self.moving[key[0]]
-        pose, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
-        v = self.map.mean(moving.slot)[pose : pose + dof]
+        pose = moving.motion.space.pose
+        dof, v = pose.dof, self.map.mean(moving.slot)[pose.size : pose.size + pose.dof]
         d = min(len(v), 3)
         if not given.has_moved(v[:d], self.map.covariance([moving.slot])[dof : dof + d, dof : dof + d]):
             return False

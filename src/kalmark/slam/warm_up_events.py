@@ -193,8 +193,8 @@ def made_up_events(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -
                     t_s += STEP_S
                     yield Scan(t_s, robot.name, name, y, ids)
             if k == ROUNDS - 2:
-                size = 2 if robot.motion.space.axes == 1 else 3
-                yield Fix(t_s, robot.name, np.asarray(robot.start)[:size], np.eye(size))
+                d = robot.motion.space.d
+                yield Fix(t_s, robot.name, np.asarray(robot.start)[:d], np.eye(d))
 
 
 def mounts_to_warm_up(robots: Iterable[Robot]) -> dict[ChannelKey, Mount]:
