@@ -92,7 +92,7 @@ def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list
 
     The sigmas are by stretches of the run where these vary more than the noise (`causes.systematic`).
     """
-    g, I, left = linear.scores(*stacked(columns))
+    g, I, left = linear.scores_of(*stacked(columns))
     prior = [KNOWN_TO.get(column.unit, np.inf) if column.name != "range_offset" else np.inf for column in columns]
     I = I + np.diag(np.array(prior) ** -2.0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(I), 1e-300))

@@ -114,8 +114,7 @@ def log_correction_line(config: Mapping[str, Any], option: str, path: tuple[str,
 
 def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, sensor, column = finding.of[:3]
-    evidence = f"{_lengths(finding)} are {abs(finding.value):.2%} too {_how(finding)} ({_sure(finding)})"
-    by = 1.0 + finding.value
+    evidence, by = _lengths(finding, ""), 1.0 + finding.value
     if column == RANGE and sensor != ALL:
         scale = _current(config, robot, "sensors", sensor, "scale") or 1.0
         return evidence, _set(robot, f"sensors.{sensor}.scale", scale * by)
@@ -129,17 +128,14 @@ def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
 def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, sensor, column = finding.of[:3]
     bias = _current(config, robot, "sensors", sensor, "bias_m") or 0.0
-    evidence = f"{_lengths(finding)} are {_size(abs(finding.value), 'm')} too {_how(finding)} ({_sure(finding)})"
     known = column == RANGE and sensor != ALL
-    return evidence, _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value) if known else ""
+    return _lengths(finding, "m"), _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value) if known else ""
 
 
-def _lengths(finding: Finding) -> str:
-    return f"{'ranges' if finding.of[2].startswith('range') else 'distances'} of {_sensor(finding)}"
-
-
-def _how(finding: Finding) -> str:
-    return "long" if finding.value > 0 else "short"
+def _lengths(finding: Finding, unit: str) -> str:
+    lengths, long = "ranges" if finding.of[2].startswith("range") else "distances", finding.value > 0
+    off = f"{_size(abs(finding.value), unit)} too {'long' if long else 'short'} ({_sure(finding)})"
+    return f"{lengths} of {_sensor(finding)} are {off}"
 
 
 def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:

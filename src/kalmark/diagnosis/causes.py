@@ -139,7 +139,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
 
 def joint_errors(linear: Linear, columns: list[Column]) -> tuple[Array, Array]:
     """Return the systematic errors s (K,), all at once and within their limits, and their information (K, K)."""
-    g, I, _ = linear.scores(*stacked(columns))
+    g, I, _ = linear.scores_of(*stacked(columns))
     s = np.linalg.lstsq(I + np.diag([c.most**-2 for c in columns]), g)[0]
     return np.asarray(s, dtype=np.float64), np.asarray(I, dtype=np.float64)
 

@@ -181,7 +181,7 @@ class Linear:
         step, m = self.reduced.solved(z, w)
         return Left(z - self.at.H @ step, m)
 
-    def scores(self, Z: Array, W: Array) -> tuple[Array, Array, Left]:
+    def scores_of(self, Z: Array, W: Array) -> tuple[Array, Array, Left]:
         """Return the scores (K,) of errors Z (N, K), W (q n, K), their information (K, K), and what is left of them."""
         have, left = self.residuals, self.left(Z, W)
         return Z.T @ have.r + W.T @ have.m, Z.T @ left.r + W.T @ left.m, left

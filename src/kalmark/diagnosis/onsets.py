@@ -164,7 +164,7 @@ def _scores(linear: Linear, column: Column, row_s: Array, step_s: Array, edges: 
         np.where((np.searchsorted(edges, of_s, side="right") - 1)[:, None] == np.arange(len(edges)), of[:, None], 0.0)
         for of_s, of in ((row_s, column.Z), (step_s, column.W))
     )
-    return linear.scores(Z, W)[:2]
+    return linear.scores_of(Z, W)[:2]
 
 
 def _piecewise_gain(linear: Linear, column: Column, row_s: Array, step_s: Array, times: Array) -> float:

@@ -102,7 +102,7 @@ def find_wrong_ids(run: Run, log: Log, now: Fit, trials: Trials) -> tuple[Mistak
     evidence = f"{out.mean():.1%} of the observations are far off where their landmark is"
     name, cure, told = (TWICE, cure, ANOTHER) if mixed else (OUTLIERS, CURE, "")
     without = first if found is None else found[1]
-    since_s = _since_s(first, np.flatnonzero(out))
+    since_s = first.history.at_s(first.history.step[out][0])
     return Mistake(name, evidence + told, cure, config, None, gain, since_s), Filtered(without, log)
 
 
@@ -194,7 +194,8 @@ def _places_of_ids(
     told = _meanings(again, surveys, names[wrong].tolist())
     if not told:
         return None, [], 0.0
-    since_s = _since_s(again, np.concatenate([_in_order(again.history, name)[-1][1] for name in told]))
+    row = min(_in_order(again.history, name)[-1][1].min() for name in told)
+    since_s = again.history.at_s(again.history.step[row])
     cause = PRIOR if {*told.values()} == {OFF_SURVEY} else MOVED if {*told.values()} <= {MOVES, GONE} else TWICE
     mistake = Mistake(cause, f"from t={since_s:.1f} s on {_together(told)}", CURE, config, None, 0.0, since_s)
     return (mistake, again), [*told], gain
@@ -214,11 +215,6 @@ def _meanings(again: Run, surveys: Mapping[str, Array], wrong: list[str]) -> dic
         elif told[name] != MOVES:
             told[name] = OFF_SURVEY
     return told
-
-
-def _since_s(run: Run, rows: Ints) -> float:
-    """Return the time of the first of some rows, s of the log."""
-    return run.history.at_s(run.history.step[rows.min()])
 
 
 def _elsewhere(h: History) -> Flags:

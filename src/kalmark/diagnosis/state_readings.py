@@ -238,7 +238,7 @@ class _Sensor:
                 yield self.in_map(SIGN, key, math.pi, ["declination_rad"], by, (f"{what}, and ", cure))
             else:
                 told = f"readings of {of} fit with {what}", cure
-                yield self.trial(SIGN, self.config, partial(_same, told), by)
+                yield self.trial(SIGN, self.config, partial(lambda told, _: told, told), by)
         if columns[:2] == ("x_m", "y_m"):
             order, exchanged = [1, 0, *range(2, len(columns))], f"readings of {of} fit with x_m and y_m exchanged"
             both = exchanged, "exchange the columns x_m and y_m"
@@ -269,15 +269,6 @@ class _Sensor:
         return best[1] if best else None
 
 
-def _same(told: tuple[str, str], _: FilteredRun) -> tuple[str, str]:
-    return told
-
-
-def _is_paid(engine: Trials, now: FilteredRun, number: int, events: list[Event]) -> bool:
-    """Return whether readings are still off, and a search for their next cause is in the budget."""
-    return bool(now.off()) and engine.pays(f"further causes in {READINGS}", number * engine.work_of(events))
-
-
 def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], FilteredRun | None]:
     """Return the faults of sensors of the state in a run that does not fit, and the fit of the log without them.
 
@@ -289,7 +280,8 @@ def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], Filtered
     events = first_events(run, log, SCANS)
     events = engine.payable(READINGS, run, events, number, number, share=RACED)
     now = filtered_with(engine, config, log, events) if events else None
-    while now is not None and len(found) < MOST_CAUSES and (not found or _is_paid(engine, now, number, events)):
+    further = f"further causes in {READINGS}", number * engine.work_of(events)
+    while now is not None and len(found) < MOST_CAUSES and (not found or (now.off() and engine.pays(*further))):
         of = [_Sensor(engine, now, config, log, events, where) for where in now.tried()]
         tried = (m for sensor in of for m in sensor.trials())
         trials = track(tried, "sensors of the state, tried", show=engine.progress)

@@ -321,17 +321,13 @@ class Moving:
         """Return whether parts of its controls, one after the other, lead to finite places, with finite covariances."""
         r = map_.mean(self.slot)
         for part in parts:
-            slots, B, u = self.added(map_, part, self._shares(part) and not part.first)
+            slots, B, u = self.added(map_, part, self.error is not None and part.shares and not part.first)
             u = u + (B @ np.concatenate([map_.mean(block) for block in slots]) if slots else 0.0)
             moved = step(self.model, r, u, part.dt_s)
             if not moved_noise(*moved, part.N)[1]:
                 return False
             r = moved[0]
         return True
-
-    def _shares(self, part: MotionPart) -> bool:
-        """Return whether the error of a part is a block of the map, which has that of other parts, too."""
-        return self.error is not None and part.shares
 
     def movement(self, map_: Map, part: MotionPart) -> Movement:
         """Return what one part of its control does to the robot in a map."""
@@ -340,7 +336,7 @@ class Moving:
         D = motion.diffusion_at(map_.mean(self.slot), u, dt_s) if self.moves_itself else motion.diffusion(u, dt_s)
         if unknown is not None:
             D = unknown if D is None else unknown + D
-        shared = self._shares(part)
+        shared = self.error is not None and part.shares  # with other parts: it is a block of the map
         slots, B, u = self.added(map_, part, shared)
         D = NO_NOISE if D is None else D
         return Movement(self.model, self.slot, slots, shared, shared and first, B, u, N, D, dt_s)
