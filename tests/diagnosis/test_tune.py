@@ -168,6 +168,17 @@ def test_the_new_file_keeps_the_users_comments_and_runs(tmp_path: Path, capsys: 
     ] == pytest.approx(1.0, abs=0.1)
 
 
+def test_a_section_that_an_override_gave_keeps_its_other_keys(tmp_path: Path) -> None:
+    lidar = "{type: range_bearing, sigma_range_m: 0.04, sigma_bearing_rad: 0.02, mount: {x_m: 0.3}}"
+    path, overrides = written(tmp_path), [f"{SENSOR.removesuffix('.')}={lidar}"]
+    tuning = tune(path, overrides=overrides)
+    assert change(tuning, SENSOR + "sigma_range_m").changed
+    (tmp_path / "tuned.yaml").write_text(new_config(path, tuning, overrides))
+    sensor = open_run(tmp_path / "tuned.yaml")[0].robots["rover"].sensors["lidar"]
+    assert sensor.sigma_range_m == pytest.approx(0.1, rel=0.15)
+    assert (sensor.sigma_bearing_rad, sensor.mount.x_m) == (0.02, 0.3)
+
+
 def test_what_cannot_be_tuned_is_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = written(tmp_path, steps=120)
     with pytest.raises(KalmarkError, match=r"share 1\.5"):
