@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from scipy.stats import norm
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import LANDMARKS
 from kalmark.batch.data import BatchInput
-from kalmark.batch.problem import observation_factor
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
 from kalmark.diagnosis.error_columns import MOST_SCALE, Column, columns_of, rates_of, stacked
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.tunable_keys import Keys, Path_
-from kalmark.models.observe import view_of
 from kalmark.results.run import Run
 
 ALPHA = 0.01  # of right configurations of which anything is changed
 KNOWN_TO = {"": MOST_SCALE, "m": 0.1}  # scales and places of mounts beforehand: what is more is no error
-MOUNT = "mount"  # the systematic error that is its place
-MOVED_M = 1e-5  # of a mount, for its derivative
 
 
 def calibrations(
@@ -34,10 +28,9 @@ def calibrations(
     """Return the calibrations that are off; the ones that the log cannot distinguish from another error name that.
 
     All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
-    Those that it determines are estimated again without scales and places of mounts, which are not linear.
+    Those that it determines are estimated again without scales, which are not linear.
     """
     columns = columns_of(linear, sensors_of(run), rates_of(linear, given.t_ns))
-    columns += _mounts(linear, given)
     paths = [keys.calibration(run, column) for column in columns]
     joined: dict[Any, Column] = {}
     for column, path in zip(columns, paths, strict=True):
@@ -57,34 +50,13 @@ def calibrations(
             chosen.append(k)
         elif _shows(*alone[k], level):
             alike[key] = f"the log does not distinguish it from other systematic errors (alone {alone[k][0]:+.3g})"
-    beside = [k for k, c in enumerate(columns) if names[k] not in paths and c.unit and c.name != MOUNT]
+    beside = [k for k, c in enumerate(columns) if names[k] not in paths and c.unit]
     s, sigma, _ = _together(linear, [columns[k] for k in chosen + beside]) if chosen else (s, sigma, alone)
     found = [
         Finding(columns[k].name, names[k], 0.0, 0.0, float(s[n]), float(sigma[n]), columns[k].unit)
         for n, k in enumerate(chosen)
     ]
     return found, alike
-
-
-def _mounts(linear: Linear, given: BatchInput) -> Iterator[Column]:
-    """Yield the change of the data by each coordinate of a sensor's position, in 1/m."""
-    none, d = np.zeros(len(linear.at.w)), linear.state.d
-    for f, factor in enumerate(linear.problem.factors):
-        robot, sensor = factor.sensor
-        mount = given.robots[robot].sensors[sensor] if sensor else None
-        if mount is None or (robot, sensor) in given.mounts or factor.term.blocks[-1].group != LANDMARKS:
-            continue
-        z, _ = factor.term.at(linear.state)
-        for axis in range(d):
-            at = np.array(mount.at, dtype=np.float64)
-            at[axis] += MOVED_M
-            view = view_of(mount.sensor, given.seen_by(mount.sensor), at)
-            moved, _ = observation_factor(view, factor.term.blocks, factor.y, factor.R, np.inf, factor.sensor).term.at(
-                linear.state
-            )
-            parts = [np.zeros(other.R.shape[:2]) for other in linear.problem.factors]
-            parts[f] += (z - moved) / MOVED_M
-            yield Column(MOUNT, (robot, sensor, "xyz"[axis]), "m", linear.whitened(parts), none)
 
 
 def _together(linear: Linear, columns: list[Column]) -> tuple[Array, Array, list[tuple[float, float]]]:

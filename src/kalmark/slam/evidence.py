@@ -68,7 +68,7 @@ class Evidence:
         missed, a seen one from when it was begun until it was seen.  Those begun `again` at these times, with their
         logs, count until then: they are older ones if the robot was elsewhere when they were begun.
         """
-        if not self.missed:
+        if all(last >= first for last, first, _ in self.missed.values()):
             self.ratio = 0.0
             return
         recent = islice(reversed(self.seen.values()), RECENT)

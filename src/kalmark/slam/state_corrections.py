@@ -10,7 +10,7 @@ from kalmark.arrays import Array
 from kalmark.errors import MapError
 from kalmark.events import Event, Fix, Scan
 from kalmark.filter.estimators import Correction
-from kalmark.geometry.spaces import SE2, SE3, Space
+from kalmark.geometry.spaces import Space
 from kalmark.report import JudgedScan, Observation, Report, outcomes_of
 from kalmark.slam import moves, relocation_by_fixes
 from kalmark.slam.checks import refuse_bad_fix
@@ -110,7 +110,7 @@ def _record_position(state: State, name: str, y: Array, R: Array, done: Correcti
     assert state.t_ns is not None
     del moving.left_out[: len(moving.left_out) + 1 - relocation_by_fixes.KEPT]
     moving.left_out.append(relocation_by_fixes.RejectedFix(y, R, done.e[0, : len(y)]))
-    size, dof = (3, 3) if moving.motion.space.axes == 1 else (7, 6)
+    size, dof = moving.motion.space.pose.size, moving.motion.space.pose.dof
     mean = state.map.mean(moving.slot)
     found = relocation_by_fixes.pose_by_fixes(
         mean[:size], state.map.covariance([moving.slot])[:dof, :dof], moving.left_out
@@ -155,10 +155,9 @@ def _doubt(
 
 def _blocks(state: State) -> list[tuple[int, Space]]:
     """Return the slots and spaces of all that a motion of the world moves: robots, clones of their poses, landmarks."""
-    poses = {name: SE2 if robot.motion.space.axes == 1 else SE3 for name, robot in state.robots.items()}
     return [
         *((moving.slot, moving.motion.space) for moving in state.moving.values()),
-        *((clone.slot, poses[clone.robot]) for clone in state.clones.clones.values()),
+        *((clone.slot, state.robots[clone.robot].motion.space.pose) for clone in state.clones.clones.values()),
         *((state.tracks.slots[name], track.model.space) for name, track in state.tracks.confirmed.items()),
     ]
 
@@ -166,8 +165,5 @@ def _blocks(state: State) -> list[tuple[int, Space]]:
 def _move(state: State, blocks: list[tuple[int, Space]], shift: relocation_by_fixes.Shift) -> None:
     """Move the whole map; its covariance becomes P + G C G', C of the motion.  Once in a run: O(n^3)."""
     found = [relocation_by_fixes.shift_block(space, state.map.mean(slot), shift) for slot, space in blocks]
-    rows = state.rows(tuple((slot, space.dof) for slot, space in blocks))
     G = np.concatenate([G_block for _, G_block in found])
-    state.map.predict(rows, np.eye(len(rows)), G @ shift.cov @ G.T)
-    for (slot, _), (mean, _) in zip(blocks, found, strict=True):
-        state.map.set_predicted(slot, mean)
+    state.move_blocks([slot for slot, _ in blocks], np.eye(len(G)), G @ shift.cov @ G.T, [mean for mean, _ in found])
