@@ -282,23 +282,24 @@ def write_nees(d: Array, P: Array, at: int, n: int, out: Array) -> None:
         out[c] = np.sum(S[n + c, :n] ** 2) if inverse * SINGULAR < 1.0 else np.nan
 
 
+@compiled
+def nees_of_rows(d: Array, P: Array) -> Array:
+    """Return the NEES (N,) of errors d (N, n) with covariances P (N, n, n), as `write_nees`."""
+    out = np.empty(len(d))
+    for k in range(len(d)):
+        write_nees(d[k : k + 1], P[k], 0, d.shape[1], out[k : k + 1])
+    return out
+
+
 def nees(d: Array, P: Array) -> Array:
     """Return d^T P^-1 d (...) for errors (..., n) and covariances (..., n, n); NaN where P is singular.
 
-    Singular: a variance that is not positive, or tr C^-1 above 1e12, C being the correlation matrix.  As `write_nees`,
-    of all covariances at once.
+    Singular: a variance that is not positive, or tr C^-1 above 1e12, C being the correlation matrix.
     """
-    P, variance = np.asarray(P, dtype=np.float64), np.einsum("...ii->...i", P)
-    with np.errstate(all="ignore"):
-        sigma = np.sqrt(variance)
-        C, scaled = P / (sigma[..., :, None] * sigma[..., None, :]), np.broadcast_to(d, sigma.shape) / sigma
-        S = np.concatenate([C, scaled[..., None, :], np.broadcast_to(np.eye(P.shape[-1]), P.shape)], axis=-2)
-        for k in range(P.shape[-1]):
-            S[..., k:, k] -= np.einsum("...ij,...j->...i", S[..., k:, :k], S[..., k, :k])
-            S[..., k:, k] /= np.sqrt(S[..., k, k])[..., None]
-        squares = np.sum(S[..., P.shape[-1] :, :] ** 2, axis=-1)
-        regular = np.all((variance > 0.0) & (variance < np.inf), axis=-1)
-        return np.where(regular & (np.sum(squares[..., 1:], axis=-1) * SINGULAR < 1.0), squares[..., 0], np.nan)
+    P = np.array(P, dtype=np.float64, order="C")
+    d = np.array(np.broadcast_to(d, P.shape[:-1]), dtype=np.float64, order="C")
+    n = P.shape[-1]
+    return nees_of_rows(d.reshape(-1, n), P.reshape(-1, n, n)).reshape(P.shape[:-2])
 
 
 @compiled
