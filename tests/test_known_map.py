@@ -14,6 +14,7 @@ from kalmark.config.opening import open_run
 from kalmark.errors import ConfigError, LogError
 from kalmark.logs.known_map import read_known
 from kalmark.logs.native_writer import write_native
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.run import Run
 from kalmark.simulate import load_world, simulate
 
@@ -33,6 +34,17 @@ def test_a_file_is_read_with_and_without_covariances(tmp_path: Path) -> None:
     assert all(landmark.cov is None for landmark in read_known(path, exact=True))
     tag = table(tmp_path / "tags.csv", "id,x_m,y_m,z_m,qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n")
     assert read_known(tag)[0].mean.shape == (7,)
+
+
+def test_a_map_with_all_that_a_run_writes_of_its_landmarks_is_a_known_map(tmp_path: Path) -> None:
+    places, cov = [np.array([1.0, 2.0]), np.array([3.0, 4.0]), np.array([5.0, 6.0])], 0.01 * np.eye(2)
+    landmarks = MapLandmarks(
+        [1, "b", 3], ["point"] * 3, places, [cov, np.zeros((2, 2)), cov], [5, 6, 7], exact=frozenset({"b"}),
+        log_odds={1: 3.0, 3: -1.0}, unseen=frozenset({3}), classes={1: ("cone", 0.98)},
+    )  # fmt: skip
+    one, other = read_known(table(tmp_path / "landmarks.csv", landmarks.to_csv()))
+    assert (one.id, one.mean.tolist(), other.id, other.cov) == (1, [1.0, 2.0], "b", None)
+    assert one.cov is not None and one.cov.tolist() == cov.tolist()
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,8 @@ def read_known(path: Path, exact: bool = False, origin: Array | None = None) -> 
         mean = np.array(row.numbers(names))
         found[name] = KnownLandmark(name, mean, None if exact else _covariance(row, names), names)
 
-    allowed, globe = ("kind", "observations", "known", "log_odds", "mark", *PLACES[2:]), Globe(origin)
+    globe = Globe(origin)
+    allowed = ("kind", "observations", "class", "class_p", "known", "log_odds", "mark", *PLACES[2:])
     table = read_table(path, ("id", "x_m", "y_m"), allowed=allowed, globe=globe)
     if table.globe is not None and origin is None:
         raise LogError(f"{path}: lat_deg and lon_deg, but the log has no origin on the globe, expected log.origin")
