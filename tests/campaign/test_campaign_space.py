@@ -11,7 +11,7 @@ from kalmark.campaign import run_campaign, scoring
 from kalmark.campaign.running import Plan, configs_of
 from kalmark.geometry import SE3
 from kalmark.geometry.rotations import exp
-from kalmark.geometry.spaces import retract
+from kalmark.geometry.spaces import RHO, VECTOR3, Space, retract
 from kalmark.simulate import load_world
 from space_worlds import faulty, world
 
@@ -30,6 +30,9 @@ def test_an_error_is_what_the_estimator_would_have_to_correct_by(coordinates: st
 
 def test_a_point_whose_depth_is_not_known_yet_is_not_judged() -> None:
     class Ray:
+        kind = "ray"
+        space = Space("ray", (VECTOR3, VECTOR3, RHO))
+
         def to_point(self, l: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             P_l = np.zeros((1, 3, 7))
             P_l[0, :, 6] = -l[0, 3:6] / l[0, 6] ** 2
@@ -51,6 +54,8 @@ def test_a_point_whose_depth_is_not_known_yet_is_not_judged() -> None:
 
 def test_a_line_is_judged_across_itself_where_its_ends_are() -> None:
     class Line:
+        kind = "line"
+        space = Space("line", (VECTOR3, VECTOR3))
         first_ends = (0.0, 1.0)
         extend = True
 

@@ -17,7 +17,7 @@ from kalmark.geometry.rotations import exp, left_jacobian_inverse, log, multiply
 from kalmark.geometry.spaces import RHO, VECTOR3, Space, retract
 from kalmark.logs.log import poses_of_size
 from kalmark.report import LandmarkTable
-from kalmark.results.evaluate import landmark_figures, line_figures
+from kalmark.results.evaluate import landmark_figures, last_observed_from
 from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.measures import point_error, pose_error, rotation_error
 from kalmark.results.record import record
@@ -191,18 +191,34 @@ def test_lines_are_judged_across_and_only_if_they_are_settled() -> None:
     shifts = {1: np.array([70.0, 0.03, 0.04]), 2: np.zeros(3), 3: np.ones(3)}
     true = {i: (l.reshape(2, 3) * [9, 1, 1] + shifts[i]).ravel() for i, l in zip(ids, places, strict=True)}
     truth = Truth(np.empty((0, 7)), true, offset=ORIGIN[7])
-    figures = line_figures(landmarks, truth)
+    eyes = np.tile([0.0, -5.0, 0.0], (3, 1))
+    figures = landmark_figures(landmarks, truth, eyes)
     assert figures["lines_compared"] == 2
     assert figures["line_rmse_raw_m"] == pytest.approx(np.sqrt(0.05**2 / 2))
-    assert line_figures(landmarks, Truth(np.empty((0, 7)), offset=ORIGIN[7])) == {}
+    assert landmark_figures(landmarks, Truth(np.empty((0, 7)), offset=ORIGIN[7]), eyes) == {}
 
 
-def test_a_point_whose_depth_is_open_is_not_compared() -> None:
-    kinds = ["point3", "inverse_depth", "inverse_depth"]
-    covariances = [np.eye(3), 1e-4 * np.eye(3), np.diag([1e-4, 1e-4, 4.0])]
-    true = {k: np.array([k * 5.0, 0, 0]) for k in range(3)}
-    ids: list[Any] = [0, 1, 2]
-    landmarks = MapLandmarks(ids, kinds, [l + 0.1 for l in true.values()], covariances, [2] * 3, True)
-    figures = landmark_figures(landmarks, Truth(np.empty((0, 7)), true, offset=ORIGIN[7]))
+def test_a_point_whose_depth_is_not_determined_from_where_it_was_observed_is_not_compared() -> None:
+    kinds = ["point3", "inverse_depth", "inverse_depth", "inverse_depth"]
+    covariances = [np.eye(3), 1e-4 * np.eye(3), np.diag([1e-4, 1e-4, 4.0]), 1e-4 * np.eye(3)]
+    true = {k: np.array([k * 5.0, 0, 0]) for k in range(4)}
+    ids: list[Any] = [0, 1, 2, 3]
+    landmarks = MapLandmarks(ids, kinds, [l + 0.1 for l in true.values()], covariances, [2] * 4, True)
+    truth = Truth(np.empty((0, 7)), true, offset=ORIGIN[7])
+    eyes = np.zeros((4, 3))
+    eyes[2, 0], eyes[3] = 5.0, np.nan  # five metres before it with a sigma of two, and never observed
+    figures = landmark_figures(landmarks, truth, eyes)
     assert figures["landmarks_compared"] == 2
     assert figures["landmark_rmse_raw_m"] == pytest.approx(0.1 * np.sqrt(3))
+    assert "line_rmse_raw_m" not in figures
+    eyes[2:] = -20.0, 0.0, 0.0  # two metres are little at that distance
+    figures = landmark_figures(landmarks, truth, eyes)
+    assert figures["landmarks_compared"] == 4
+    assert figures["landmark_rmse_raw_m"] == pytest.approx(0.1 * np.sqrt(3))
+
+
+def test_a_landmark_was_last_observed_from_where_its_robot_was_then(run: Run) -> None:
+    h, (name, *_) = run.history, run.landmarks.ids
+    (step,) = {int(h.step[row]) for row in np.flatnonzero(h.fused & (h.landmark == str(name)))[-1:]}
+    eyes = last_observed_from(h, [name, "nowhere"])
+    np.testing.assert_array_equal(eyes, [h.poses[step, :3], [np.nan] * 3])

@@ -2,13 +2,7 @@
 
 The error d of an estimate x is what the estimator would have to correct it by: in "log" coordinates its retraction
 (`kalmark.geometry.spaces.retract`) by the error `turn` of the observing robot's orientation gives the truth, in "world"
-coordinates plain plus does.  A landmark is judged by what of it has a truth, whatever its state in the map is:
-
-=======  ====================================================================  ===
-point    its Euclidean position                                                2|3
-line     across itself, where the true ends are: along it, nothing is known    4
-tag      its pose                                                              6
-=======  ====================================================================  ===
+coordinates plain plus does.  Landmarks are judged as those of a run are (`kalmark.results.landmark_errors`).
 """
 
 from __future__ import annotations
@@ -26,8 +20,9 @@ from kalmark.events import Id, Scan
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.spaces import POINT2, POINT3
 from kalmark.models.landmarks import Polar2D
-from kalmark.models.protocols import Pointed, Segmented, place_of
 from kalmark.report import Report
+from kalmark.results.landmark_errors import BlockError, landmark_error
+from kalmark.results.landmark_table import place_and_jacobian
 from kalmark.results.measures import (
     MAP_NEES,
     aligned_rmse,
@@ -43,26 +38,12 @@ from kalmark.results.measures import (
 from kalmark.simulate.robots import Simulation
 from kalmark.slam.slam import Slam
 
-FAR = 3.0  # a point of unknown depth is judged once its depth exceeds so many of its sigmas
-NO_POINTS = np.empty((0, 0))
+ANY_ENDS = np.array([0.0, 1.0])  # of a line, which is judged where the true ends are
 NEES = ("pose", "heading", "state", "landmarks", "joint", "mount")
 SERIES = (
     *NEES, "pose_world", "landmarks_world", "joint_world", *(f"{name}_dof" for name in NEES),
     "position_m", "heading_rad", "mount_m", "mount_rad",
 )  # fmt: skip
-
-
-class BlockError(NamedTuple):
-    """A block's error d (f,) in own and in world coordinates, and its Jacobian F (f, dof) in the block's error.
-
-    `place` (k, 2|3) and `truth` (k, 2|3) are the points of it to align maps by.
-    """
-
-    own: Array
-    world: Array
-    F: Array
-    place: Array = NO_POINTS
-    truth: Array = NO_POINTS
 
 
 class Uncertain(NamedTuple):
@@ -95,21 +76,18 @@ def robot_turn(mean: Array, truth: Array) -> Any:
 def judge_landmark(
     model: Any, mean: Array, P: Array, truth: Array, turn: Any, coordinates: str, eye: Array
 ) -> BlockError | None:
-    """Judge a landmark seen from `eye` (2|3,); None while its depth is all but unknown, or it is of another kind."""
-    if len(truth) in (4, 6):
-        return _judge_line(model, mean, P, truth, turn, coordinates, eye) if isinstance(model, Segmented) else None
-    if len(truth) == 7:
-        if len(mean) != 7:
-            return None
-        own, world = (state_error(mean, truth, turn, c) for c in (coordinates, "world"))
-        return BlockError(own, world, np.eye(6), mean[None, :3], truth[None, :3])
-    point, F = _position(model, mean, len(truth))
-    if isinstance(model, Pointed) and len(mean) > len(truth) and not _is_known(point, F @ P @ F.T, eye):
+    """Judge a landmark last observed from `eye` (2|3,), as `landmark_error`, by the error of its state."""
+    found = place_and_jacobian(model, mean, ANY_ENDS)
+    if found is None:
         return None
-    own, world = (point_error(point, truth, turn, c) for c in (coordinates, "world"))
+    place, P_l = found
+    error = landmark_error(model.kind, place, P_l @ P @ P_l.T, truth, eye, turn, coordinates)
+    if error is None:
+        return None
+    own, world, F, *points = error
     if isinstance(model, Polar2D):  # its Gaussian is on an arc: so is its error
-        own, world = (_unrolled(mean, error) for error in (own, world))
-    return BlockError(own, world, F, point[None], truth[None])
+        own, world = _unrolled(mean, own), _unrolled(mean, world)
+    return BlockError(own, world, F @ P_l, *points)
 
 
 def _unrolled(l: Array, error: Array) -> Array:
@@ -117,41 +95,6 @@ def _unrolled(l: Array, error: Array) -> Array:
     u, d = np.array([np.cos(l[2]), np.sin(l[2])]), l[3]
     n, w = np.array([-u[1], u[0]]), d * u + error
     return d * np.arctan2(w @ n, w @ u) * n + (np.linalg.norm(w) - d) * u
-
-
-def _is_known(point: Array, P: Array, eye: Array) -> bool:
-    """Return whether all sigmas of a point (d,), covariance P (d, d), are below a third of its distance."""
-    return bool(np.isfinite(P).all() and FAR**2 * np.linalg.norm(P, 2) < np.sum((point - eye) ** 2))
-
-
-def _position(model: Any, mean: Array, d: int) -> tuple[Array, Array]:
-    """Return the Euclidean position (d,) of a landmark's state, and its Jacobian (d, dof)."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        found = place_of(model, mean[None])
-    if found is None or found[0].shape[1] != d:
-        return mean[:d], np.eye(d, len(mean))
-    return found[0][0], found[1][0]
-
-
-def _judge_line(
-    model: Any, mean: Array, P: Array, truth: Array, turn: Array, coordinates: str, eye: Array
-) -> BlockError | None:
-    """Judge a line by how far it passes from the two true ends (4|6,): in the plane two numbers, in space four."""
-    l, d = mean[None], len(truth) // 2
-    base, _ = model.endpoints(l, np.array([[0.0, 1.0]]))
-    a, along = base[0, 0], base[0, 1] - base[0, 0]
-    ends = truth.reshape(2, d)
-    t = (ends - a) @ along / (along @ along)
-    q, Q_l = model.endpoints(l, t[None])
-    across = np.linalg.svd(along[None])[2][1:]  # (d - 1, d): at right angles to the line
-    to_eye = np.eye(d) - np.outer(along, along) / (along @ along)
-    if d == 3 and not all(
-        _is_known(to_eye @ q[0, i], to_eye @ Q_l[0, i] @ P @ Q_l[0, i].T @ to_eye, to_eye @ eye) for i in (0, 1)
-    ):
-        return None
-    own, world = (point_error(q[0], ends, turn, c) @ across.T for c in (coordinates, "world"))
-    F = (across @ Q_l[0]).reshape(own.size, -1)
-    return BlockError(own.ravel(), world.ravel(), F, q[0], q[0] + world @ across)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +159,7 @@ class _Scorer:
         self.mean, self.P = np.full((*shape, size), np.nan), np.full((*shape, dof, dof), np.nan)
         self.series = {key: np.full(shape, np.nan) for key in SERIES}
         self.true_id: dict[Id, Id | None] = {}
+        self.eyes: dict[Id, Array] = {}  # where each landmark was last observed from
         self.uncertain = {
             f"{name}.{key}": Uncertain(name, simulated.mounts[name, key], np.diagonal(mount.cov) > 0)
             for name, robot in slam.robots.items()
@@ -228,14 +172,16 @@ class _Scorer:
     def after(self, report: Report, scan: Scan) -> None:
         """Take in one scan."""
         real = self.simulated.origins[scan.t_ns, scan.robot, scan.sensor]
+        row, k = self.rows[scan.robot], self.at[scan.t_ns]
+        mean, P, dof = self.slam.mean(scan.robot), self.slam.covariance(scan.robot), self.P.shape[-1]
         for o in report.observations:
+            if o.outcome in ("associated", "new") and o.landmark is not None:
+                self.eyes[o.landmark] = mean[: self.d]
             if o.outcome == "new" and o.landmark is not None:
                 self.true_id[o.landmark] = real[o.index]
             elif o.outcome == "associated" and o.d2 is not None:
                 self.nis += o.d2
                 self.nis_dof += report.z.shape[1]
-        row, k = self.rows[scan.robot], self.at[scan.t_ns]
-        mean, P, dof = self.slam.mean(scan.robot), self.slam.covariance(scan.robot), self.P.shape[-1]
         self.mean[row, k], self.P[row, k] = mean[: self.mean.shape[-1]], P[:dof, :dof]
         if len(mean) > self.mean.shape[-1]:
             turn = robot_turn(mean, self._state(scan.robot, k))
@@ -267,7 +213,7 @@ class _Scorer:
         for name, of in self.uncertain.items():
             d = errors[name][of.open]
             mounts[name] = BlockError(d, d, np.eye(len(slam.covariance(name)))[np.flatnonzero(of.open)])
-        landmarks = dict(self._landmarks(turn, slam.mean(robot)[: self.d]))
+        landmarks = dict(self._landmarks(turn))
         self._score_mounts({n: errors[n] for n, of in self.uncertain.items() if of.carrier == robot}, row, k)
         judged |= mounts | landmarks
         F = block_diagonal([j.F for j in judged.values()])
@@ -278,7 +224,7 @@ class _Scorer:
         for key, value in zip(MAP_NEES, map_nees(d, P, first, sizes).tolist(), strict=True):
             self.series[key][row, k] = value
 
-    def _landmarks(self, turn: Any, eye: Array) -> Iterator[tuple[Id, BlockError]]:
+    def _landmarks(self, turn: Any) -> Iterator[tuple[Id, BlockError]]:
         """Yield the landmarks that have a truth, and whose depth is known well enough."""
         slam, coordinates = self.slam, self.slam.estimator.coordinates
         points: dict[Id, Array] = {}
@@ -288,7 +234,9 @@ class _Scorer:
                 continue
             if model.space in (POINT2, POINT3) and len(truth) == self.d:
                 points[name] = truth
-            elif j := judge_landmark(model, slam.mean(name), slam.covariance(name), truth, turn, coordinates, eye):
+                continue
+            state = slam.mean(name), slam.covariance(name)
+            if j := judge_landmark(model, *state, truth, turn, coordinates, self.eyes[name]):
                 yield name, j
         if points:  # all at once
             truth, place = np.array([*points.values()]), np.array([slam.mean(name) for name in points])
@@ -316,8 +264,8 @@ class _Scorer:
             self.series["state"][row, steps] = nees(errors, covariances)
             self.series["state_dof"][row, steps] = errors.shape[1]
         d, robot = self.d, self.log.robots[0]
-        mean = self.slam.mean(robot)
-        judged = [j for _, j in self._landmarks(robot_turn(mean, self._state(robot, self.last)), mean[:d])]
+        turn = robot_turn(self.slam.mean(robot), self._state(robot, self.last))
+        judged = [j for _, j in self._landmarks(turn)]
         place, true = (np.concatenate([np.empty((0, d)), *(j[i] for j in judged)]) for i in (3, 4))
         found = place, true, len(judged), sum(true is not None for true in self.true_id.values())
         coordinates = self.slam.estimator.coordinates

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.events import Id
 from kalmark.logs.log import poses_of_size
 from kalmark.logs.source import records_of
 from kalmark.report import OUTCOMES
@@ -17,7 +17,8 @@ from kalmark.results.association_errors import association_figures, best_known, 
 from kalmark.results.control_gaps import gap_figures, gap_notes
 from kalmark.results.figure_texts import Figures, count, figure
 from kalmark.results.history import History, Ints
-from kalmark.results.landmark_table import EUCLIDEAN, MapLandmarks, across_line
+from kalmark.results.landmark_errors import landmark_error
+from kalmark.results.landmark_table import MapLandmarks
 from kalmark.results.measures import (
     Rigid,
     aligned_rmse,
@@ -43,7 +44,6 @@ from kalmark.results.wrong_starts import restarts
 FIX_GAP_S = 3.0  # no path is interpolated across a longer gap between scans
 FIX_NEAR_M = 10.0
 PIXEL = 2  # numbers that a camera without depth measures of a point
-SETTLED = 0.01  # of the map's extent: the sigma below which a point that is not Euclidean yet is compared
 
 
 def evaluate(run: Recording) -> Figures:
@@ -84,7 +84,7 @@ def evaluate(run: Recording) -> Figures:
         found = sum(a != b for a, b in zip(landmarks.ids, run.landmarks.ids, strict=True))
         summary["landmarks_matched"] = f"{found} of {len(landmarks)} by position, of {len(run.truth.landmarks)} true"
     summary |= association_figures(history, run.landmarks.ids)
-    summary |= landmark_figures(landmarks, run.truth) | line_figures(landmarks, run.truth)
+    summary |= landmark_figures(landmarks, run.truth, last_observed_from(history, run.landmarks.ids))
     if not np.isnan(history.left_px).all():
         summary["corner_rms_px"] = float(np.sqrt(np.nanmean(history.left_px**2)))
     if history.mounts:
@@ -248,59 +248,43 @@ def known_landmarks(run: Recording) -> MapLandmarks:
     return replace(run.landmarks, ids=[names.get(i, i) for i in run.landmarks.ids])
 
 
-def landmark_figures(landmarks: MapLandmarks, truth: Truth) -> Figures:
-    """Return the landmark errors, raw and after their own rigid alignment, over the ids that map and truth share.
+def landmark_figures(landmarks: MapLandmarks, truth: Truth, eyes: Array) -> Figures:
+    """Return the errors of landmarks over the ids that map and truth share, those known exactly left out.
 
-    Those known exactly do not count.  Points that are not Euclidean yet count if they are known to a hundredth of the
-    extent of the true map: the depth of the others is still open.
+    Those of points and the centres of tags are raw and after their own rigid alignment; those of lines, if there are
+    any true ones, are raw.  `eyes` (K, 2|3) are where the landmarks were last observed from, NaN if nowhere:
+    `kalmark.results.landmark_errors` has which landmarks count.
     """
     true = {str(i): l for i, l in truth.landmarks_in_map().items()}
     if not true:
         return {}
-    means, covariances = landmarks.positions()
-    d = means.shape[1]
-    extent = float(np.linalg.norm(np.ptp([l[:d] for l in true.values()], axis=0)))
-    rows = [
-        k
-        for k, (i, kind, place) in enumerate(zip(landmarks.ids, landmarks.kinds, landmarks.means, strict=True))
-        if str(i) in true
-        and i not in landmarks.exact
-        and 2 * d not in (len(place), len(true[str(i)]))
-        and (kind in EUCLIDEAN or _sigma(covariances[k]) < SETTLED * extent)
-    ]
-    estimate = means[rows]
-    position = np.array([true[str(landmarks.ids[k])][:d] for k in rows]).reshape(-1, d)
-    enough = len(rows) >= d
-    return {
-        "landmark_rmse_m": aligned_rmse(estimate, position) if enough else float("nan"),
-        "landmark_rmse_raw_m": rmse(estimate - position),
-        "landmarks_compared": len(rows),
-    }
-
-
-def line_figures(landmarks: MapLandmarks, truth: Truth) -> Figures:
-    """Return the distances of the true ends of lines from the estimated lines, over those with a settled place.
-
-    Across the lines: along them nothing is known.  Nothing is aligned.
-    """
     d = landmarks.d
-    true = {str(i): l.reshape(2, d) for i, l in truth.landmarks_in_map().items() if len(l) == 2 * d}
-    if not true:
-        return {}
-    extent = float(np.linalg.norm(np.ptp(np.concatenate(list(true.values())), axis=0)))
-    errors = []
-    for i, place, P in zip(landmarks.ids, landmarks.means, landmarks.covariances, strict=True):
-        if str(i) not in true or len(place) != 2 * d or not np.isfinite(P).all():
+    points, lines = [np.empty((2, 0, d))], [np.empty((2, 0, d))]
+    table = zip(landmarks.ids, landmarks.kinds, landmarks.means, landmarks.covariances, eyes, strict=True)
+    for name, kind, place, P, eye in table:
+        if str(name) not in true or name in landmarks.exact:
             continue
-        across = across_line(place.reshape(2, d))
-        if max(_sigma(across @ P[k : k + d, k : k + d] @ across) for k in (0, d)) < SETTLED * extent:
-            errors.append((true[str(i)] - place[:d]) @ across)
-    return {"line_rmse_raw_m": rmse(np.reshape(errors, (-1, d))), "lines_compared": len(errors)}
+        error = landmark_error(kind, place, P, true[str(name)], eye)
+        if error is not None:
+            (points if len(error.place) == 1 else lines).append(np.array([error.place, error.truth]))
+    estimate, position = np.concatenate(points, axis=1)
+    figures: Figures = {
+        "landmark_rmse_m": aligned_rmse(estimate, position) if len(estimate) >= d else float("nan"),
+        "landmark_rmse_raw_m": rmse(estimate - position),
+        "landmarks_compared": len(estimate),
+    }
+    if any(len(l) == 2 * d for l in true.values()):
+        nearest, ends = np.concatenate(lines, axis=1)
+        figures |= {"line_rmse_raw_m": rmse(nearest - ends), "lines_compared": len(lines) - 1}
+    return figures
 
 
-def _sigma(P: Array) -> float:
-    """Return the sigma along the worst axis, infinite if P is."""
-    return math.sqrt(max(np.linalg.eigvalsh(P)[-1], 0.0)) if np.isfinite(P).all() else math.inf
+def last_observed_from(history: History, ids: Sequence[Id]) -> Array:
+    """Return where the robot was that observed each landmark (K,) last, (K, 2|3), NaN of those never observed."""
+    rows = np.flatnonzero(history.fused)[::-1]
+    names, latest = np.unique(history.landmark[rows], return_index=True)
+    eyes = dict(zip(names.tolist(), history.poses[history.step[rows[latest]], : history.d], strict=True))
+    return np.array([eyes.get(str(name), np.full(history.d, np.nan)) for name in ids]).reshape(-1, history.d)
 
 
 def path_at(history: History, robot: str, t_ns: Ints, max_gap_s: float = FIX_GAP_S) -> Array:

@@ -136,13 +136,24 @@ def _motions(places: Array, d: int, size: int, origin: Array) -> Array:
     return np.pad(whole, ((0, 0), (0, size - whole.shape[1]), (0, 0)))
 
 
+def place_and_jacobian(model: Landmark, l: Array, ends: Array | None = None) -> tuple[Array, Array] | None:
+    """Return the place (m,) of a landmark's state l (n,) and its Jacobian (m, dof) in the landmark's error.
+
+    `ends` (2,) are the abscissas of a line's ends.  None if its model has no position.
+    """
+    if model.kind in EUCLIDEAN:
+        return l, np.eye(model.space.dof)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        found = _places_of_states(model, l[None], [ends])
+    return None if found is None else (found[0][0], found[1][0])
+
+
 def _place_jacobian(slam: Slam, name: Id) -> Array:
     """Return the Jacobian (m, dof) of a landmark's place in its error."""
     model = slam.landmark_model(name)
     assert model is not None  # it is in the map
-    own = model.kind in EUCLIDEAN
-    found = None if own else _places_of_states(model, slam.mean(name)[None], [slam.segment_ends(name)])
-    return np.eye(model.space.dof) if found is None else found[1][0]
+    found = place_and_jacobian(model, slam.mean(name), slam.segment_ends(name))
+    return np.eye(model.space.dof) if found is None else found[1]
 
 
 def _crosses(slam: Slam, names: Sequence[Id], others: Sequence[Id]) -> Iterator[tuple[Id, Array]]:
