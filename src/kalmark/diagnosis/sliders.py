@@ -29,7 +29,7 @@ from kalmark.files import write
 from kalmark.logs.log import Log
 from kalmark.logs.progress import track
 from kalmark.results.history import History, Ints
-from kalmark.results.measures import anees_interval, nees, nis, pose_error
+from kalmark.results.measures import anees_interval, associated_nis, nees, nis_of_groups, pose_error
 from kalmark.results.run import Run
 from kalmark.results.run_page import round_significant
 
@@ -160,15 +160,12 @@ def _drawn(run: Run) -> dict[str, Any]:
 
 def _nis_over_time(h: History) -> dict[str, Any]:
     """Return the NIS per degree of freedom of stretches of scans, when these are, and the 95 % bounds of each."""
-    used = h.outcome == "associated"
-    value, dof = nis(h.z[used], h.Z[used])
-    stretch = h.step[used] * POINTS // max(len(h.t_ns), POINTS)
-    total, degrees = np.bincount(stretch, np.nan_to_num(value)), np.bincount(stretch, dof).astype(int)
-    at = np.flatnonzero(degrees)
-    bounds = np.array([anees_interval(n) for n in degrees[at].tolist()]).reshape(-1, 2) / degrees[at, None]
+    value, dof, step = associated_nis(h)
+    stretch = step * POINTS // max(len(h.t_ns), POINTS)
+    at, per_dof, bounds = nis_of_groups(value, dof, stretch)
     return {
-        "nisT": round_significant(np.bincount(stretch, h.t_s[h.step[used]])[at] / np.bincount(stretch)[at], 4),
-        "nis": round_significant(total[at] / degrees[at], 3),
+        "nisT": round_significant(np.bincount(stretch, h.t_s[step])[at] / np.bincount(stretch)[at], 4),
+        "nis": round_significant(per_dof, 3),
         "nisBounds": [round_significant(each, 3) for each in bounds],
     }
 

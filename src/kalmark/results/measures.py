@@ -367,6 +367,18 @@ def associated_nis(history: History) -> tuple[Array, Ints, Ints]:
     return value[dof > 0], dof[dof > 0], history.step[used][dof > 0]
 
 
+def nis_of_groups(value: Array, dof: Ints, group: Ints) -> tuple[Ints, Array, Array]:
+    """Return the groups (G,) with any NIS, their NIS per degree of freedom, and the bounds (G, 2) of 95 % of each.
+
+    `value` (K,), `dof` (K,) and `group` (K,) are of observations.
+    """
+    total, dof = np.bincount(group, value), np.bincount(group, dof).astype(np.int64)
+    groups = np.flatnonzero(dof)
+    number, which = np.unique(dof[groups], return_inverse=True)
+    bounds = np.array([anees_interval(n) for n in number.tolist()]).reshape(-1, 2)[which]
+    return groups, total[groups] / dof[groups], bounds / dof[groups, None]
+
+
 def truncated_variance(gate: float, dof: int) -> float:
     """Return the variance of whitened innovations of `dof` numbers of which a gate on d2 leaves out the rest.
 

@@ -43,7 +43,7 @@ from kalmark.results.figure_texts import (
 )
 from kalmark.results.filter_description import KEPT
 from kalmark.results.history import WHOLE, Camera, History, Ints, LandmarkChange, MapSnapshot
-from kalmark.results.measures import anees_interval, associated_nis, nees, pose_error, sigmas
+from kalmark.results.measures import anees_interval, associated_nis, nees, nis_of_groups, pose_error, sigmas
 from kalmark.results.plot import BEHIND, Projection
 from kalmark.results.recording import Recording, config_yaml
 from kalmark.results.scene import (
@@ -343,15 +343,13 @@ def _nis(run: Recording, t: Array) -> Data:
     steps, at = np.unique(step, return_inverse=True)
     window = max(1, -(-len(t) // (POINTS // 4)))
     groups, gaps = group_steps(steps, history.t_ns[steps], window)
-    total = np.bincount(groups[at], value)
-    degrees = np.bincount(groups[at], dof).astype(int)
-    bounds = {n: anees_interval(n) for n in np.unique(degrees).tolist()}
-    low, high = np.array([bounds[n] for n in degrees.tolist()]).reshape(-1, 2).T / degrees
+    _, per_dof, bounds = nis_of_groups(value, dof, groups[at])
+    low, high = map(round_significant, bounds.T)
     return {
         "t": round_significant(np.bincount(groups, t[steps]) / np.bincount(groups), 7),
-        "value": round_significant(total / degrees),
-        "low": round_significant(low),
-        "high": round_significant(high),
+        "value": round_significant(per_dof),
+        "low": low,
+        "high": high,
         "gaps": gaps.tolist(),
         "window": window,
     }
