@@ -225,10 +225,9 @@ def _made(config: Config, path: KeyPath, make: Callable[..., Any], *args: Any, *
 
 def refuse_controls(config: Config, key: str, name: str, columns: KeyPath, log: Log) -> None:
     """Refuse controls that the motion of a robot does not take."""
-    given = tuple(log.control_columns.get(name, columns))
-    if given != columns:
-        wanted = f"{', '.join(columns)} of its motion {config.robots[key].motion.type}"
-        raise _other_columns(log, name, "", given, wanted, _fitting("motion", given), f"{key}.motion", columns)
+    if name in log.control_columns:
+        of = f"its motion {config.robots[key].motion.type}"
+        log.refuse_columns(name, "", columns, of, did_you_mean, partial(_type_hint, "motion", f"{key}.motion", columns))
 
 
 def refuse_scans(config: Config, key: str, name: str, mounts: Mapping[str, Mount], log: Log) -> None:
@@ -236,12 +235,12 @@ def refuse_scans(config: Config, key: str, name: str, mounts: Mapping[str, Mount
     for (robot, sensor), given in log.sensor_columns.items():
         if robot != name or sensor not in mounts or not isinstance(mounts[sensor].detector, Laser | None):
             continue
-        raw = mounts[sensor].detector is not None
-        columns = RAW[: max(len(given), 2)] if raw else mounts[sensor].sensor.columns
-        if given != columns:
-            kind = "its beams" if raw else f"its type {config.robots[key].sensors[sensor].type}"
-            fitting, wanted = [] if raw else _fitting("sensor", given), f"{', '.join(columns)} of {kind}"
-            raise _other_columns(log, name, sensor, given, wanted, fitting, f"{key}.sensors.{sensor}", columns)
+        if mounts[sensor].detector is not None:
+            log.refuse_columns(name, sensor, RAW[: max(len(given), 2)], "its beams", did_you_mean)
+            continue
+        of, columns = f"its type {config.robots[key].sensors[sensor].type}", tuple(mounts[sensor].sensor.columns)
+        hint = partial(_type_hint, "sensor", f"{key}.sensors.{sensor}", columns)
+        log.refuse_columns(name, sensor, columns, of, did_you_mean, hint)
     used = [sensor for robot, sensor in log.sensors() if robot == name]
     other = next((sensor for sensor in used if sensor not in mounts), None)
     if other is None or config.log.on_error == "skip":
@@ -259,19 +258,9 @@ def refuse_scans(config: Config, key: str, name: str, mounts: Mapping[str, Mount
     raise LogError(f"{where}: {what}; if it is another one, add robots.{key}.sensors.{other}")
 
 
-def _other_columns(
-    log: Log, robot: str, sensor: str, given: KeyPath, wanted: str, fitting: list[Any], key: str,
-    columns: KeyPath,
-) -> LogError:  # fmt: skip
-    """Return the error of columns other than those wanted, with a type that has them or the column that was meant."""
-    missing = [name for name in columns if name not in given]
-    meant = next(filter(None, (did_you_mean(name, missing) for name in given if name not in columns)), "")
-    hint = f"; try --set robots.{key}.type={fitting[0]}" if fitting else meant
+def _type_hint(role: str, key: str, columns: KeyPath, given: KeyPath) -> str:
+    """Return a hint at a type of kalmark's own models that takes the columns given, or at a height in the plane."""
     if given == (*columns, "z_m"):
-        hint = "; leave z_m out, on the globe height_m: the robot is in the plane"
-    return log.other_columns(robot, sensor, given, wanted + hint)
-
-
-def _fitting(role: str, columns: KeyPath) -> list[str | None]:
-    """Return the types of kalmark's own models that take these columns."""
-    return [registered_name(model) for model in built_in(role) if model.columns == columns]
+        return "; leave z_m out, on the globe height_m: the robot is in the plane"
+    fitting = next((registered_name(model) for model in built_in(role) if model.columns == given), None)
+    return f"; try --set robots.{key}.type={fitting}" if fitting else ""

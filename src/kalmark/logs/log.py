@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -205,11 +205,24 @@ class Log:
         """Return the robot and the sensor of every scan or raw data, each once, in the order of the first."""
         return [*dict.fromkeys((event.robot, event.sensor) for event in self.events if isinstance(event, Scan | Raw))]
 
-    def other_columns(self, robot: str, sensor: str, given: Iterable[str], wanted: str) -> LogError:
-        """Return the error of other columns than are `wanted` of a robot's controls (sensor ""), or of its scans."""
+    def refuse_columns(
+        self, robot: str, sensor: str, columns: Names, of: str, near: Callable[[str, list[str]], str],
+        hint: Callable[[Names], str] = lambda given: "",
+    ) -> None:  # fmt: skip
+        """Refuse other `columns` than those `of` a model, of a robot's controls (sensor "") or of its scans.
+
+        The message ends with a `hint` at the columns given, else at the first missing one that is `near` one of them.
+        Raises LogError.
+        """
+        given = tuple(self.sensor_columns[robot, sensor] if sensor else self.control_columns[robot])
+        if given == columns:
+            return
+        missing = [name for name in columns if name not in given]
+        meant = (near(name, missing) for name in given if name not in columns)
         where = f"{self.places[robot, sensor][0]}:1" if (robot, sensor) in self.places else self.path or "log"
         what = f"the scans of {robot} by {sensor}" if sensor else f"the controls of {robot}"
-        return LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}")
+        wanted = f"{', '.join(columns)} of {of}{hint(given) or next(filter(None, meant), '')}"
+        raise LogError(f"{where}: {what} have the columns {', '.join(given)}, expected {wanted}")
 
     def without_truth(self) -> Log:
         """Return the log without all that only scores a run: true poses, landmarks and ids, `gps`, `reference`."""

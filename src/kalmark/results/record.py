@@ -388,22 +388,16 @@ def refuse_other_columns(slam: Slam, log: Log) -> None:
     Columns that are not known come last, in the file's order: a misspelt one would be taken for another number.
     Raises LogError.
     """
-    taken: list[tuple[str, str, Any, Any]] = [
-        (robot, "", given, slam.robots[robot].motion)
-        for robot, given in log.control_columns.items()
-        if robot in slam.robots
+    taken: list[tuple[str, str, Any]] = [
+        (robot, "", slam.robots[robot].motion) for robot in log.control_columns if robot in slam.robots
     ]
-    for (robot, sensor), given in log.sensor_columns.items():
+    for robot, sensor in log.sensor_columns:
         mount = slam.robots[robot].sensors.get(sensor) if robot in slam.robots else None
         if mount is not None and mount.detector is None:
-            taken.append((robot, sensor, given, mount.sensor))
-    for robot, sensor, given, model in taken:
-        columns = tuple(model.columns)
-        if is_own(type(model)) and registered_name(type(model)) and tuple(given) != columns:
-            missing = [name for name in columns if name not in given]
-            hint = next(filter(None, (spelling_hint(name, missing) for name in given if name not in columns)), "")
-            wanted = f"{', '.join(columns)} of its {type(model).__name__}{hint}"
-            raise log.other_columns(robot, sensor, given, wanted)
+            taken.append((robot, sensor, mount.sensor))
+    for robot, sensor, model in taken:
+        if is_own(type(model)) and registered_name(type(model)):
+            log.refuse_columns(robot, sensor, tuple(model.columns), f"its {type(model).__name__}", spelling_hint)
 
 
 def refuse_other_times(log: Log) -> None:
