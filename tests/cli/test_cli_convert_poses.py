@@ -74,6 +74,30 @@ def test_a_run_comes_back_from_its_graph_with_the_same_map(space: bool, kalmark:
     assert refused.status == 2 and "no run to write, expected the folder of one" in refused.err
 
 
+def test_edges_of_a_graph_are_of_distances_where_ranges_have_a_scale_and_a_bias(
+    kalmark: Kalmark, tmp_path: Path
+) -> None:
+    scans = write_log(tmp_path / "log") / "scans.csv"
+
+    def edges(sensor: str) -> np.ndarray:
+        (tmp_path / "own.yaml").write_text(f"log: {{path: log}}\nrobots: {{each: {{sensors: {{lidar: {sensor}}}}}}}\n")
+        assert kalmark("run", "own.yaml", "--out", "run").status == 0
+        (tmp_path / "run.g2o").unlink(missing_ok=True)
+        assert kalmark("convert", "run", "run.g2o").status == 0
+        lines = [line.split() for line in (tmp_path / "run.g2o").read_text().splitlines()]
+        return np.array([cells[3:] for cells in lines if cells[0] == "EDGE_SE2_XY"], dtype=np.float64)
+
+    plain = edges("{type: range_bearing}")
+    header, *rows = scans.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    rows = [",".join([*row[:4], repr(1.25 * float(row[4]) + 0.5), row[5]]) for row in cells]
+    scans.write_text("\n".join([header, *rows]) + "\n")
+    scaled = edges("{type: range_bearing, scale: 1.25, bias_m: 0.5}")
+    np.testing.assert_allclose(scaled[:, :2], plain[:, :2], atol=1e-9)
+    information = [xx * yy - xy**2 for xx, xy, yy in (plain[:, 2:].T, scaled[:, 2:].T)]
+    np.testing.assert_allclose(information[1], 1.25**2 * information[0], rtol=1e-6)  # a metre is .8 m of distance
+
+
 def test_a_run_without_scans_has_no_graph(kalmark: Kalmark, tmp_path: Path) -> None:
     write_log(tmp_path / "log")
     (tmp_path / "log" / "scans.csv").unlink()

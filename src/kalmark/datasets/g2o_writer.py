@@ -87,24 +87,16 @@ def graph(run: Run, log: Log, robots: Mapping[str, Robot]) -> Iterator[str]:
 def _observed(event: Scan | Raw, robot: Robot, history: Any, rows: list[int]) -> Iterator[tuple[str, Array, Array]]:
     """Yield landmark, position in the robot's frame (d,) and covariance of the observations that were fused."""
     mount = robot.sensors[event.sensor]
-    at, m = np.array(mount.at), len(mount.sensor.columns)
+    sensor: Any = mount.sensor  # of points
+    at, m = np.array(mount.at), len(sensor.columns)
     own = event.cov if isinstance(event, Scan) and mount.detector is None else None
     for row in rows:
-        y = history.y[row, :m]
-        R = mount.sensor.noise(y[None])[0] if own is None else own if own.ndim == 2 else own[int(history.index[row])]
-        p, J = _position(y) if tuple(mount.sensor.columns) in POLAR else (y, np.eye(m))
-        p, _, P_p = FRAMES[len(at)].from_frame(at, p)
-        J = P_p @ J
+        y = history.y[row, None, :m]
+        R = sensor.noise(y)[0] if own is None else own if own.ndim == 2 else own[int(history.index[row])]
+        (v,), (V_y,) = sensor.invert(y)
+        p, _, P_v = FRAMES[len(at)].from_frame(at, v)
+        J = P_v @ V_y
         yield str(history.landmark[row]), p, J @ R @ J.T
-
-
-def _position(y: Array) -> tuple[Array, Array]:
-    """Return the position of a range with one or two angles, and its Jacobian."""
-    r, a, e = (*y, 0.0)[:3]
-    ca, sa, ce, se = np.cos(a), np.sin(a), np.cos(e), np.sin(e)
-    p = r * np.array([ca * ce, sa * ce, se])
-    J = np.array([[ca * ce, -r * sa * ce, -r * ca * se], [sa * ce, r * ca * ce, -r * sa * se], [se, 0.0, r * ce]])
-    return p[: len(y)], J[: len(y), : len(y)]
 
 
 def _vertices(chain: Chain, nodes: dict[int, Array], robots: Mapping[str, Robot]) -> Iterator[str]:
