@@ -1,7 +1,7 @@
 """A robot that is carried away unnoticed: is it found by its landmarks, and when?  One that is not: does it stay?
 
-    python benchmarks/carried.py                       # four fields, with ids and without, 5 seeds
-    python benchmarks/carried.py --worlds dense --runs 20
+    python benchmarks/carried.py                       # four fields, with ids and without, 20 seeds
+    python benchmarks/carried.py --worlds dense --runs 5
 
 A piece is cut out of a simulated log, after the robot has been round: its events stop at one place and go on at
 another.  A line a case: runs, robots found (at the end within .5 m of where it is, after the map is moved onto the true
@@ -92,7 +92,7 @@ def carried_runs(keys: list[str], ids: bool, seed: int) -> tuple[bool, list[floa
 def main() -> None:
     """Print a line a world and kind of association."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--worlds", nargs="+", default=[*WORLDS])
     args = parser.parse_args()
     for world, ids in itertools.product(args.worlds, (True, False)):
