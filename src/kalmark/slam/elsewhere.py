@@ -9,7 +9,6 @@ there; what was mapped meanwhile goes.
 
 from __future__ import annotations
 
-import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,13 +37,14 @@ from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import Space
 from kalmark.management import existence
 from kalmark.report import ELSEWHERE, Gap
-from kalmark.slam.evidence import RECENT, Evidence
+from kalmark.slam.evidence import Evidence
 from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
 from kalmark.slam.state import State
 from kalmark.tracks.channel import EUCLIDEAN
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.survey_checks import SURVEYED
+from kalmark.tracks.track import Tracks
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
@@ -87,7 +87,7 @@ def hold_back_far(
     far = _far(scan, update, done, limit_of(state, scan))
     if not far:
         return done
-    of = _evidence(state, scan.event.robot)
+    of = state.evidence_of(scan.event.robot)
     fits = np.flatnonzero(done.fused).tolist()
     of.miss((names[k] for k in far), [-SURE] * len(far), scan.event.t_ns, state.begun_ns)
     of.see((names[k] for k in fits), [SURE] * len(fits), scan.event.t_ns, state.begun_ns)
@@ -115,19 +115,9 @@ def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> l
     return [k for k, is_one in zip(far, is_seen.tolist(), strict=True) if is_one]
 
 
-def _evidence(state: State, robot: str) -> Evidence:
-    """Return the evidence of a robot; new, it has the landmarks with ids that fitted when the robot saw them last."""
-    if robot not in state.evidence:
-        invented, tracks = state.tracks.is_invented, state.tracks.confirmed.values()
-        named = (track for track in tracks if track.last[1] == robot and not invented(track.id))
-        last = reversed(heapq.nlargest(RECENT, named, key=lambda track: track.last))
-        state.evidence[robot] = Evidence({t.id: (state.begun_ns(t.id), t.last[0], SURE) for t in last})
-    return state.evidence[robot]
-
-
-def _young(state: State, robot: str, of: Evidence) -> list[Id]:
+def _young(tracks: Tracks, robot: str, of: Evidence) -> list[Id]:
     """Return the landmarks of the map that a robot began since the onset."""
-    begun = ((name, track.begun) for name, track in state.tracks.confirmed.items())
+    begun = ((name, track.begun) for name, track in tracks.confirmed.items())
     return [name for name, (t_ns, by) in begun if by == robot and t_ns > of.since_ns]
 
 
@@ -135,7 +125,7 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
     """Count the landmarks that a scan observed and missed, and place its robot where the odds suffice."""
     robot = scan.event.robot
     if look is not None or scan.adrift:
-        _evidence(state, robot)
+        state.evidence_of(robot)
     of, all_named = state.evidence.get(robot), None not in scan.ids
     if of is None or not scan.report.observations:
         return
@@ -183,7 +173,7 @@ def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | N
 
 def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
     """Return the landmarks that were in the map before, as they are now."""
-    tracks, young, channel = state.tracks, _young(state, scan.event.robot, of), scan.channel
+    tracks, young, channel = state.tracks, _young(state.tracks, scan.event.robot, of), scan.channel
     kind = channel.landmark.kind if channel.gives_places else EUCLIDEAN[scan.dimensions - 2]
     known, old = tracks.known.of_kind.get(kind), Known(channel.models[kind].landmark)
     for name in known.names if known is not None else ():
@@ -208,7 +198,7 @@ def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[
     ]
     more += [
         (None, (*state.map.mean(tracks.slots[name])[:d].tolist(), float(np.median(sigma))))
-        for name in _young(state, scan.event.robot, of)
+        for name in _young(tracks, scan.event.robot, of)
         if name not in shown and tracks.is_invented(name)
     ]
     if more:
@@ -316,7 +306,7 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
     of.weigh(_mapped_again(state, scan, before, after, cov))
     moved = [*own, *(tracks.slots[name] for name in mapped)]
     state.move_blocks(moved, F, Q, map(other.map.mean, own))
-    for name in _young(state, robot, of):
+    for name in _young(tracks, robot, of):
         state.remove(name)
         scan.report.removed += ((name, MEANWHILE),)
     for track in [*tracks.tentative.values()]:

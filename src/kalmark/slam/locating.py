@@ -266,8 +266,8 @@ def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Arr
 def inflate_covariance(state: State, name: str, landmarks: Sequence[Id], factor: float) -> None:
     """Multiply the joint covariance of a robot and of landmarks by a factor: their drift is larger than that."""
     slots = [state.moving[name].slot, *state.tracks.slots_of(landmarks).tolist()]
-    rows = np.concatenate([state.map.index(slot) for slot in slots])
-    state.map.predict(rows, math.sqrt(factor) * np.eye(len(rows)), np.zeros((len(rows), len(rows))))
+    n = sum(len(state.map.rows(slot)) for slot in slots)
+    state.move_blocks(slots, math.sqrt(factor) * np.eye(n), np.zeros((n, n)))
 
 
 def _put(state: State, scan: ScanContext, T: Array) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -10,6 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.association import Association
+from kalmark.association.global_start import SURE
 from kalmark.declare import Role, Within, check_parameters
 from kalmark.errors import DivergedError, MapError, ModelError
 from kalmark.events import Event, Id, label_of_event
@@ -21,7 +23,7 @@ from kalmark.management.upkeep import CAREFUL, Upkeep
 from kalmark.models.protocols import Landmark, OfState, measures_blocks, world_of
 from kalmark.models.sensors import Gps2D, Gps3D
 from kalmark.slam.checks import check_covariance, fault_of, instance, refuse_odd_association, require_methods
-from kalmark.slam.evidence import NEVER_NS, Evidence
+from kalmark.slam.evidence import NEVER_NS, RECENT, Evidence
 from kalmark.slam.gaussian_sum import GaussianSum
 from kalmark.slam.held_control import HeldInput, Moving, bias_block, bias_name
 from kalmark.slam.held_readings import SELDOM, LastMeasurement
@@ -318,6 +320,15 @@ class State:
         if self.is_surveyed(name):
             return NEVER_NS
         return self.tracks.confirmed[name].begun[0] if name in self.tracks.confirmed else 0
+
+    def evidence_of(self, robot: str) -> Evidence:
+        """Return the evidence of a robot; new, it has the landmarks with ids as the robot saw them last."""
+        if robot not in self.evidence:
+            tracks = self.tracks.confirmed.values()
+            named = (track for track in tracks if track.last[1] == robot and not self.tracks.is_invented(track.id))
+            last = reversed(heapq.nlargest(RECENT, named, key=lambda track: track.last))
+            self.evidence[robot] = Evidence({t.id: (self.begun_ns(t.id), t.last[0], SURE) for t in last})
+        return self.evidence[robot]
 
     def settle(self) -> None:
         """Notify sources that something else than their scans changes the map."""
