@@ -14,6 +14,7 @@ from kalmark.models import landmarks3d as lm
 from kalmark.simulate.layouts import Cloister, House, ThickCloister
 from toolbox import (
     TURNED,
+    Array,
     Case,
     Pair,
     frame,
@@ -119,10 +120,24 @@ def pose_euler(i: Case, o: Case) -> list[Pair]:
     return [(e, o["ep"]), (E_f, o["EP_qp"] @ frame_tangent(i["qp"]))]
 
 
+def calibrate_radial(x: Array, d: Array) -> Array:
+    """Return the Jacobian XD_d (K, 2, n) of `cameras.radial_many` in the distortion."""
+    r2 = np.sum(x * x, axis=1)[:, None]
+    return x[:, :, None] * (r2 ** np.arange(1, len(d) + 1))[:, None]
+
+
+def calibrate_pinhole(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
+    """Return the Jacobians E_k (K, 2, 4) and E_d (K, 2, n) of `cameras.project_pinhole`."""
+    x = v[:, :2] / v[:, 2:]
+    xd = cameras.radial_many(x, d)[0]
+    E_k = np.concatenate([xd[:, :, None] * np.eye(2), np.tile(np.eye(2), (len(v), 1, 1))], axis=2)
+    return E_k, k[:2, None] * calibrate_radial(x, d)
+
+
 def pinhole(i: Case, o: Case) -> list[Pair]:
     k = k_of(i["k"])
     e, E_v = one(cameras.project_pinhole, i["p"], k, i["d"])
-    E_k, E_d = one(cameras.calibrate_pinhole, i["p"], k, i["d"])
+    E_k, E_d = one(calibrate_pinhole, i["p"], k, i["d"])
     theirs = np.roll(o["U_k"], 2, axis=1)
     return [(e, o["u"]), (E_v, o["U_p"]), (E_k, theirs), (E_d, o["U_d"].reshape(2, -1))]
 
@@ -136,19 +151,23 @@ def back_pinhole(i: Case, o: Case) -> list[Pair]:
 
 
 def radial(i: Case, o: Case) -> list[Pair]:
-    x, X_x, X_d = one(cameras.radial_many, i["u"], i["d"] if "d" in i else i["c"])
+    d = i["d"] if "d" in i else i["c"]
+    x, X_x = one(cameras.radial_many, i["u"], d)
+    X_d = calibrate_radial(i["u"][None], d)
     theirs = [o[n] for n in (("ud", "UD_u", "UD_d") if "d" in i else ("uc", "UC_u", "UC_c"))]
     return list(zip((x, X_x, X_d.reshape(theirs[2].shape)), theirs, strict=True))
 
 
 def omni(i: Case, o: Case) -> list[Pair]:
-    e, E_v = one(cameras.project_omni, i["p"], i["k"], i["pol"])
-    return [(e, o["u"]), (E_v, o["U_p"])]
+    par = cameras.lens_parameters("omnidirectional", i["k"], i["pol"], ())
+    e, E_v = cameras.project(cameras.OMNI, i["p"][None], par)
+    return [(e[0], o["u"]), (E_v[0], o["U_p"])]
 
 
 def back_omni(i: Case, o: Case) -> list[Pair]:
     """The recorded P_u lacks the projection (I - m m') of the exact one."""
-    m, M_y = one(cameras.back_project_omni, i["u"], i["k"], i["pol"])
+    par = cameras.lens_parameters("omnidirectional", i["k"], (), i["pol"])
+    m, M_y = (a[0] for a in cameras.back_project(cameras.OMNI, i["u"][None], par))
     return [(m, o["p"]), (M_y, (np.eye(3) - np.outer(m, m)) @ o["P_u"])]
 
 
@@ -185,7 +204,7 @@ def projection(name: str) -> Callable[[Case, Case], list[Pair]]:
         v, V_T, V_l = seen_from(T, i["l"][None, order])
         k = k_of(i["k"])
         e, E_v = cameras.project_pinhole(v, k, i["d"])
-        E_k, E_d = one(cameras.calibrate_pinhole, v[0], k, i["d"])
+        E_k, E_d = one(calibrate_pinhole, v[0], k, i["d"])
         E_T = E_v[0] @ V_T[0]
         return [
             (e[0], o["u"]),

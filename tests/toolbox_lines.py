@@ -12,6 +12,7 @@ from kalmark.geometry import directions, frames3d, rotations
 from kalmark.models import cameras, landmarks, lines
 from kalmark.models import landmarks3d as lm
 from toolbox import Array, Case, Pair, frame, frame_tangent, k_of, one
+from toolbox_functions import calibrate_pinhole
 
 HERE = np.array([0.0, 0, 0, 0, 0, 0, 1])
 PIXELS = np.array([1.0, 1, 0, 0])  # intrinsics that leave pixels as they are
@@ -84,7 +85,7 @@ def seen_ends(i: Case, o: Case, p: Array) -> list[Pair]:
     v, V_T, _ = lm.point_seen_from(T, p)
     e, E_v = cameras.project_pinhole(v, k_of(i["k"]), NO_LENS)
     E_T = (E_v @ V_T).reshape(4, 6)
-    E_k = cameras.calibrate_pinhole(v, k_of(i["k"]), NO_LENS)[0].reshape(4, 4)
+    E_k = calibrate_pinhole(v, k_of(i["k"]), NO_LENS)[0].reshape(4, 4)
     S_r, S_s = of_frames(o, "S", i)
     pairs = [(e.ravel(), o["s"].ravel()), (v[:, 2], o["d"].ravel())]
     return [*pairs, (E_T @ T_r, S_r), (E_T @ T_s, S_s), (E_k, np.roll(o["S_k"], 2, axis=1))]

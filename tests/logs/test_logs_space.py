@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from kalmark.errors import LogError
 from kalmark.events import Control
 from kalmark.logs import Log, open_log, write_native
-from kalmark.models.cameras import project_omni, project_pinhole
+from kalmark.models.cameras import OMNI, lens_parameters, project, project_pinhole
 from space_logs import Data, controls, in_sensor, opened, pose_of, scans
 
 
@@ -122,7 +122,7 @@ def pixels(p: np.ndarray, s: dict[str, Any]) -> np.ndarray:
     """Return the pixels (K, 2) of points (K, 3) in the frame of a camera that a log describes."""
     if s["type"] == "omnidirectional":
         k = np.array([s["cx_px"], s["cy_px"], s["c"], s["d"], s["e"]])
-        return project_omni(p, k, np.array(s["projection"]))[0]
+        return project(OMNI, p, lens_parameters("omnidirectional", k, s["projection"], ()))[0]
     k = np.array([s["fx_px"], s["fy_px"], s["cx_px"], s["cy_px"]])
     return project_pinhole(p, k, np.array(s.get("distortion", [])))[0]
 

@@ -11,6 +11,7 @@ import kalmark as km
 from differences import agree, derivative
 from kalmark.errors import EventError, ModelError
 from kalmark.models import cameras
+from toolbox_functions import calibrate_pinhole
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -41,11 +42,19 @@ def one(function: Any, *arguments: Any) -> Any:
     return lambda x: function(x[None], *arguments)[0][0]
 
 
+def project_omni(v: Array, a: Array = OMNI) -> tuple[Array, Array]:
+    return cameras.project(cameras.OMNI, v, cameras.lens_parameters("omnidirectional", OMNI_K, a, OMNI_BACK))
+
+
+def back_project_omni(y: Array) -> tuple[Array, Array]:
+    return cameras.back_project(cameras.OMNI, y, cameras.lens_parameters("omnidirectional", OMNI_K, OMNI, OMNI_BACK))
+
+
 @pytest.mark.parametrize("d", LENSES, ids=str)
 def test_the_pin_hole_has_the_jacobians_of_its_differences(d: list[float], rng: np.random.Generator) -> None:
     lens, v = np.array(d), in_front(rng)
     e, E_v = cameras.project_pinhole(v, K, lens)
-    E_k, E_d = cameras.calibrate_pinhole(v, K, lens)
+    E_k, E_d = calibrate_pinhole(v, K, lens)
     for i in range(len(v)):
         agree(E_v[i], derivative(one(cameras.project_pinhole, K, lens), v[i], first=0.02 * v[i, 2]))
         agree(E_k[i], derivative(lambda k: cameras.project_pinhole(v[i : i + 1], k, lens)[0][0], K))
@@ -82,9 +91,10 @@ def test_a_distortion_that_folds_inside_the_image_is_refused() -> None:
     assert cameras.valid_radius([]) == np.inf
     with pytest.raises(ModelError, match=r"distortion \[-0.3\]: reaches radius 0\.7027"):
         cameras.fit_correction([-0.3], K, SIZE)
+    to_corner = np.hypot(330 / 320, 245 / 330)  # of an image that shows this much of the plane z = 1
     with pytest.raises(ModelError, match=r"no correction of 20 coefficients within 0\.005 px"):
-        cameras.fit_correction([-0.3], K, SIZE, radius=0.7)
-    assert len(cameras.fit_correction([-0.3], K, SIZE, radius=0.5)) <= 10
+        cameras.fit_correction([-0.3], K * [to_corner / 0.7, to_corner / 0.7, 1, 1], SIZE)
+    assert len(cameras.fit_correction([-0.3], K * [to_corner / 0.5, to_corner / 0.5, 1, 1], SIZE)) <= 10
 
 
 def test_the_omnidirectional_camera_has_the_jacobians_of_its_differences(rng: np.random.Generator) -> None:
@@ -92,38 +102,38 @@ def test_the_omnidirectional_camera_has_the_jacobians_of_its_differences(rng: np
     v[::4, 2] = 1e-3 * rng.normal(size=50)  # across the edge between ahead and behind
     v[1::8, :2] *= 1e-2  # near the axis, on which the polynomial of this calibration leaves a radius of a pixel
     v[:, 2] = np.where(np.hypot(v[:, 0], v[:, 1]) < 0.1, abs(v[:, 2]) + 0.1, v[:, 2])
-    e, E_v = cameras.project_omni(v, OMNI_K, OMNI)
+    e, E_v = project_omni(v)
     for i in range(len(v)):
         step = 0.1 * np.hypot(v[i, 0], v[i, 1])
-        agree(E_v[i], derivative(one(cameras.project_omni, OMNI_K, OMNI), v[i], first=step))
-    np.testing.assert_allclose(cameras.project_omni(7 * v, OMNI_K, OMNI)[0], e, atol=1e-9)
+        agree(E_v[i], derivative(one(project_omni), v[i], first=step))
+    np.testing.assert_allclose(project_omni(7 * v)[0], e, atol=1e-9)
 
 
 def test_the_omnidirectional_camera_is_regular_on_its_axis() -> None:
     a = np.array([np.pi / 2, -1.0]) * 300  # radius proportional to the angle from the axis
     axis = np.array([[0.0, 0, 2]])
-    e, E_v = cameras.project_omni(axis, OMNI_K, a)
+    e, E_v = project_omni(axis, a)
     np.testing.assert_allclose(e[0], OMNI_K[:2], atol=1e-12)
-    _, near = cameras.project_omni(np.array([[1e-6, -2e-6, 2.0]]), OMNI_K, a)
+    _, near = project_omni(np.array([[1e-6, -2e-6, 2.0]]), a)
     np.testing.assert_allclose(E_v, near, atol=1e-3)
     np.testing.assert_allclose(E_v[0, 0, 0], 150, atol=1e-9)
 
 
 def test_omnidirectional_rays_have_the_jacobians_of_their_differences(rng: np.random.Generator) -> None:
     y = rng.uniform(0, (1280, 800), (200, 2))
-    m, M_y = cameras.back_project_omni(y, OMNI_K, OMNI_BACK)
+    m, M_y = back_project_omni(y)
     np.testing.assert_allclose(np.linalg.norm(m, axis=1), 1, atol=1e-15)
     for i in range(len(y)):
-        agree(M_y[i], derivative(one(cameras.back_project_omni, OMNI_K, OMNI_BACK), y[i], first=2.0))
-    centre, M_centre = cameras.back_project_omni(OMNI_K[None, :2], OMNI_K, OMNI_BACK)
+        agree(M_y[i], derivative(one(back_project_omni), y[i], first=2.0))
+    centre, M_centre = back_project_omni(OMNI_K[None, :2])
     np.testing.assert_array_equal(centre, [[0, 0, 1]])
     assert np.isfinite(M_centre).all()
 
 
 def test_omnidirectional_pixels_come_back_to_the_calibrations_accuracy(rng: np.random.Generator) -> None:
     y = OMNI_K[:2] + rng.uniform(-350, 350, (200, 2))
-    rays, _ = cameras.back_project_omni(y, OMNI_K, OMNI_BACK)
-    again, _ = cameras.project_omni(rays, OMNI_K, OMNI)
+    rays, _ = back_project_omni(y)
+    again, _ = project_omni(rays)
     assert np.hypot(*(again - y).T).max() < 5  # the two polynomials are fitted separately, to a few pixels
 
 

@@ -197,18 +197,22 @@ def test_borders_of_the_image_are_in_view() -> None:
     np.testing.assert_array_equal(cameras.is_in_view(cameras.RADIAL, v, par, np.array([100.0, 100])), [1, 1, 0, 0])
 
 
-def test_the_omnidirectional_lens_is_the_existing_camera(rng: np.random.Generator) -> None:
+def test_the_omnidirectional_lens_is_that_of_scaramuzza(rng: np.random.Generator) -> None:
     par, size = cameras.lens_parameters("omnidirectional", OMNI_K, OMNI, OMNI_BACK), np.array([1280.0, 800.0])
     y = rng.uniform(0, size, (100, 2))
-    k, a, b = (np.array(x, dtype=float) for x in (OMNI_K, OMNI, OMNI_BACK))
-    rays = cameras.back_project(cameras.OMNI, y, par)
-    for one, other in zip(rays, cameras.back_project_omni(y, k, b), strict=True):
-        np.testing.assert_array_equal(one, other)
-    pixels = cameras.project(cameras.OMNI, rays[0], par), cameras.project_omni(rays[0], k, a)
-    for one, other in zip(*pixels, strict=True):
-        np.testing.assert_array_equal(one, other)
-    inside = (np.abs(cameras.project(cameras.OMNI, rays[0], par)[0] / size - 0.5) <= 0.5).all(axis=1)
-    np.testing.assert_array_equal(cameras.is_in_view(cameras.OMNI, rays[0], par, size), inside)
+    centre, affine = np.array(OMNI_K[:2]), np.array([[1.0, OMNI_K[4]], [OMNI_K[3], OMNI_K[2]]])
+    m, M_y = cameras.back_project(cameras.OMNI, y, par)
+    flat = np.linalg.solve(affine, (y - centre).T).T
+    height = np.polynomial.Polynomial(OMNI_BACK)(np.linalg.norm(flat, axis=1))
+    rays = np.column_stack([flat, height])
+    np.testing.assert_allclose(m, rays / np.linalg.norm(rays, axis=1)[:, None], atol=1e-14)
+    e, E_m = cameras.project(cameras.OMNI, m, par)
+    across = np.linalg.norm(m[:, :2], axis=1)
+    radius = np.polynomial.Polynomial(OMNI)(np.arctan2(m[:, 2], across))
+    np.testing.assert_allclose(e, centre + (radius / across)[:, None] * m[:, :2] @ affine.T, atol=1e-10)
+    np.testing.assert_allclose(E_m @ M_y, np.tile(np.eye(2), (len(y), 1, 1)), atol=0.1)  # the two are fitted apart
+    inside = (np.abs(e / size - 0.5) <= 0.5).all(axis=1)
+    np.testing.assert_array_equal(cameras.is_in_view(cameras.OMNI, m, par, size), inside)
     assert not cameras.is_in_view(cameras.OMNI, np.array([[0.01, 0, -1.0]]), par, size)[0]
 
 

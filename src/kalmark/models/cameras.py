@@ -9,7 +9,7 @@ EQUIDISTANT      theta_d = theta (1 + k1 theta^2 + k2 theta^4 + ...)            
 TSAI             x = x_d (1 + c1 r_d^2 + c2 r_d^4 + ...)                        fx fy cx cy, limit, n, c (n), its limit
 DAVISON          r_d = r / sqrt(1 + 2 k r^2)                                    fx fy cx cy, limit, 1, k
 FOV              r_d = atan(2 r tan(w / 2)) / w                                 fx fy cx cy, limit, 1, w
-OMNI             `project_omni`, `back_project_omni`                            cx cy c d e, n, a (n), b
+OMNI             a polynomial of the angle above the image plane                cx cy c d e, n, a (n), b
 ===============  =============================================================  ===============================
 
 Intrinsics are k = (fx, fy, cx, cy) in pixels.  `limit` is the radius on the plane z = 1 (EQUIDISTANT: the angle theta)
@@ -17,9 +17,10 @@ at which the distortion stops growing and the image would fold over.  Pixels and
 nothing: beyond the limit, and behind the camera (z <= 0; an EQUIDISTANT lens images that too, up to its limit, and OMNI
 gives a pixel to every direction).  `lens_parameters` makes `par`.  The correction c of a radial distortion has its
 form.  TSAI (1987) has a polynomial that takes the distortion off, limited in r_d; DAVISON (MonoSLAM, 2007) and FOV
-(Devernay and Faugeras, 2001) have one number.  OMNI is Scaramuzza's (2006): polynomials between the angle and the
-radius in the image, and an affine matrix of the pixels.  Nothing depends on the length of v, so that v may be the ray
-to a landmark of unknown depth.  [TB] `pinHole`, `invPinHole`, `omniCam`, `invOmniCam`.
+(Devernay and Faugeras, 2001) have one number.  OMNI is Scaramuzza's (2006): the polynomial a gives the radius in the
+image from the angle above the image plane, atan2(z, hypot(x, y)), b the height z of a ray (p, q, z) from that radius;
+(cx, cy) and [[1, e], [d, c]] are the centre and the affine matrix of the pixels (u, v).  Nothing depends on the length
+of v, so that v may be the ray to a landmark of unknown depth.  [TB] `pinHole`, `invPinHole`, `omniCam`, `invOmniCam`.
 """
 
 from __future__ import annotations
@@ -166,7 +167,7 @@ def invert_distortion(rd: float, d: Array, limit: float) -> float:
 @compiled
 def radtan_many(x: Array, d: Array) -> tuple[Array, Array]:
     """Distort x (K, 2) on the plane z = 1 by d = (k1, k2, k3, p1, p2): xd (K, 2) and XD_x (K, 2, 2).  OpenCV."""
-    xd, XD_x, _ = radial_many(x, d[:3])
+    xd, XD_x = radial_many(x, d[:3])
     p1, p2 = d[3], d[4]
     for i in range(len(x)):
         a, b = x[i, 0], x[i, 1]
@@ -348,24 +349,21 @@ def undistorted_radius(lens: int, rd: float, par: Array) -> tuple[float, float]:
 
 # ---------------------------------------------------------------------- pin holes
 @compiled
-def radial_many(x: Array, d: Array) -> tuple[Array, Array, Array]:
-    """Scale x (K, 2) by 1 + d1 r^2 + d2 r^4 + ...: xd, XD_x (K, 2, 2), XD_d (K, 2, n).  [TB] `distort`, `undistort`."""
-    k, n = len(x), len(d)
-    xd, XD_x, XD_d = np.empty((k, 2)), np.empty((k, 2, 2)), np.empty((k, 2, n))
-    for i in range(k):
+def radial_many(x: Array, d: Array) -> tuple[Array, Array]:
+    """Scale x (K, 2) by 1 + d1 r^2 + d2 r^4 + ...: xd (K, 2) and XD_x (K, 2, 2).  [TB] `distort`, `undistort`."""
+    xd, XD_x = np.empty((len(x), 2)), np.empty((len(x), 2, 2))
+    for i in range(len(x)):
         r2 = x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1]
         scale, rate, power = 1.0, 0.0, 1.0  # rate: d scale / d r^2
-        for j in range(n):
+        for j in range(len(d)):
             rate += (j + 1) * d[j] * power
             power *= r2
             scale += d[j] * power
-            for a in range(2):
-                XD_d[i, a, j] = x[i, a] * power
         for a in range(2):
             xd[i, a] = scale * x[i, a]
             for b in range(2):
                 XD_x[i, a, b] = 2 * rate * x[i, a] * x[i, b] + (scale if a == b else 0.0)
-    return xd, XD_x, XD_d
+    return xd, XD_x
 
 
 @compiled
@@ -396,21 +394,8 @@ def _pixels(k: Array, xd: Array, XD_x: Array, X_v: Array) -> tuple[Array, Array]
 def project_pinhole(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
     """Return the pixels e (K, 2) of v (K, 3), and E_v (K, 2, 3); meaningful where z > 0."""
     x, X_v = plane_many(v)
-    xd, XD_x, _ = radial_many(x, d)
+    xd, XD_x = radial_many(x, d)
     return _pixels(k, xd, XD_x, X_v)
-
-
-@compiled
-def calibrate_pinhole(v: Array, k: Array, d: Array) -> tuple[Array, Array]:
-    """Return the Jacobians E_k (K, 2, 4) and E_d (K, 2, n) of `project_pinhole` in its intrinsics and distortion."""
-    xd, _, XD_d = radial_many(plane_many(v)[0], d)
-    E_k, E_d = np.zeros((len(v), 2, 4)), np.empty((len(v), 2, len(d)))
-    for i in range(len(v)):
-        for a in range(2):
-            E_k[i, a, a], E_k[i, a, 2 + a] = xd[i, a], 1.0
-            for j in range(len(d)):
-                E_d[i, a, j] = k[a] * XD_d[i, a, j]
-    return E_k, E_d
 
 
 def back_project_pinhole(y: Array, k: Array, c: Array) -> tuple[Array, Array]:
@@ -427,18 +412,18 @@ def valid_radius(d: Any) -> float:
     return math.sqrt(turns.min()) if len(turns) else math.inf
 
 
-def fit_correction(d: Any, k: Any, size: Any, tolerance_px: float = 0.005, radius: float | None = None) -> Array:
+def fit_correction(d: Any, k: Any, size: Any, tolerance_px: float = 0.005) -> Array:
     """Fit the shortest correction c (n,) of the distortion d (k,) within `tolerance_px` over an image (width, height).
 
-    Least squares of pixels at Chebyshev nodes of r_d^2 from the centre to the farthest corner, or to `radius` on the
-    plane z = 1.  Raise ModelError where that is more than the distortion can reach, or if 20 coefficients do not
-    suffice, as where the lens almost folds the image: then `radius` limits the part of the image that is used.
+    Least squares of pixels at Chebyshev nodes of r_d^2 from the centre to the farthest corner.  Raise ModelError where
+    that is more than the distortion can reach, or if 20 coefficients do not suffice, as where the lens almost folds the
+    image.
     """
     d, k, size = (np.asarray(a, dtype=np.float64) for a in (d, k, size))
     if not d.any():
         return np.zeros(0)
     reach = np.maximum(k[2:], size - k[2:]) / k[:2]
-    rd = (radius or math.hypot(*reach)) * np.sqrt(0.5 - 0.5 * np.cos(np.pi * np.arange(201) / 200))[1:]
+    rd = math.hypot(*reach) * np.sqrt(0.5 - 0.5 * np.cos(np.pi * np.arange(201) / 200))[1:]
     r = undistorted_radii(rd, d)
     n_d = np.arange(1, len(d) + 1)
     pixels = (1 + r[:, None] ** (2 * n_d) @ ((2 * n_d + 1) * d)) * k[:2].max()  # d pixel / d r
@@ -478,23 +463,6 @@ def polynomial(a: Array, x: float) -> tuple[float, float]:
         rate = rate * x + value
         value = value * x + a[j]
     return value, rate
-
-
-def project_omni(v: Array, k: Array, a: Array) -> tuple[Array, Array]:
-    """Return the pixels e (K, 2) of v (K, 3), and E_v (K, 2, 3), of an omnidirectional camera.
-
-    k = (cx, cy, c, d, e), the centre and the affine matrix [[1, e], [d, c]] in (u, v); a: the radius in the image as a
-    polynomial of the angle above the image plane, atan2(z, hypot(x, y)).  On the axis itself the pixel is the centre.
-    """
-    return project(OMNI, v, np.concatenate([k, [len(a)], a]))
-
-
-def back_project_omni(y: Array, k: Array, b: Array) -> tuple[Array, Array]:
-    """Return the viewing rays m (K, 3), unit vectors, of pixels y (K, 2), and M_y (K, 3, 2).
-
-    k as in `project_omni`; b: the height z as a polynomial of the radius in the image, the ray being (p, q, z).
-    """
-    return back_project(OMNI, y, np.concatenate([k, [0.0], b]))
 
 
 @compiled

@@ -60,7 +60,6 @@ class _Doppler(Cone):
     columns: ClassVar[tuple[str, ...]] = ("range_rate_mps",)
     sigmas: ClassVar[tuple[str, ...]] = ("sigma_rate_mps",)
     expected = expect_range_rate
-    additive: ClassVar[bool] = True
     sees_velocity: ClassVar[bool] = True
 
 

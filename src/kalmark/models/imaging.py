@@ -170,7 +170,7 @@ class PixelDepth(_Lens):
 class Omnidirectional(_Camera):
     """Scaramuzza's camera with a wide view that measures points: pixels u, v.
 
-    `cameras.project_omni` explains the polynomials.  [TB] omniCam.
+    `kalmark.models.cameras` explains the polynomials.  [TB] omniCam.
 
     >>> eye = km.Mount(km.sensors.Omnidirectional(), at=(0, 0, 0, -0.5, 0.5, -0.5, 0.5))  # looks ahead
     >>> slam = km.Slam(km.Robot("drone", km.motion.Odometry3D(), sensors={"eye": eye}))

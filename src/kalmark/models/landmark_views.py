@@ -284,7 +284,6 @@ class Spatial(Expecting):
 
     world = "space"
     sees_kinds: ClassVar[tuple[str, ...]] = ("point3",)
-    additive: ClassVar[bool] = True
 
     def expect(self, v: Array, y: Array | None = None) -> tuple[Array, Array]:
         """Return the expected measurements (K, m) of views v (K, d), and E_v (K, p, d or the view's errors).

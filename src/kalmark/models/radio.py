@@ -67,8 +67,6 @@ class _Receiver(Distancing):
     _: KW_ONLY
     range_max_m: Annotated[Limit, "Farthest landmark that is received."] = math.inf
 
-    additive: ClassVar[bool] = True
-
     def sees(self, v: Array) -> Flags:
         """Return which of v (K, d) are near enough."""
         near: Flags = np.linalg.norm(self.risen(v), axis=1) <= self.range_max_m
