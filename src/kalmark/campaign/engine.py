@@ -26,6 +26,7 @@ from kalmark.filter.map import StochasticMap
 from kalmark.filter.maps import DENSE
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
+from kalmark.geometry.matrices import product
 from kalmark.geometry.spaces import Table
 from kalmark.models.landmark_views import LOOK, NOISE, look, noise_of
 from kalmark.models.landmarks import Point2D
@@ -144,7 +145,7 @@ def start_landmark(
     l, L_T, L_v = look(of, (T, v))
     for i in range(block[1]):
         x[block[0] + i] = x_first[block[0] + i] = l[0, i]
-    n, L_r = block[2] + block[3], kernels.product(L_T[0], T_r)
+    n, L_r = block[2] + block[3], product(L_T[0], T_r)
     kernels.augment(P, n, np.arange(block[2], n), np.arange(3), L_r, kernels.quadratic(L_v[0], Q))
 
 

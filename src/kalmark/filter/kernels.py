@@ -24,6 +24,7 @@ from threadpoolctl import ThreadpoolController
 
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
+from kalmark.geometry.matrices import product
 
 
 def _load_blas(module: str) -> str:
@@ -110,18 +111,6 @@ def set_rows(P: Array, index: Index, B: Array) -> None:
             P[i, j] = B[a, j]
         for j in range(i, B.shape[1]):
             P[j, i] = B[a, j]
-
-
-@compiled
-def product(A: Array, B: Array) -> Array:
-    """Return A B, for an A (m, k) that is so small that a call of BLAS would cost more than the sum."""
-    out = np.zeros((len(A), B.shape[1]))
-    for i in range(len(A)):
-        for k in range(len(B)):
-            a = A[i, k]
-            for j in range(B.shape[1]):
-                out[i, j] += a * B[k, j]
-    return out
 
 
 @compiled
@@ -249,7 +238,7 @@ def subtract_symmetric(P: Array, L: Array, R: Array) -> None:
     for first in range(0, n, band):
         last = min(first + band, n)
         C, here = P.ctypes.data + first * P.strides[0], L.ctypes.data + first * L.strides[1]
-        subtract_outer(C, P.shape[1], here, last - first, R.ctypes.data, last, q, n)
+        subtract_product(C, P.shape[1], here, last - first, R.ctypes.data, last, q, n, True)
     L[0, 0], R[0, 0] = L[0, 0], R[0, 0]  # keeps them alive until the calls are over
 
 
@@ -299,19 +288,13 @@ def add_half_turn(w: Array, a: Array, theta: Index) -> None:
 
 
 @compiled
-def subtract_product(C: int, stride: int, L: int, rows: int, R: int, columns: int, q: int, n: int) -> None:
-    """C -= L R' for L (rows, q) and R (columns, q), of n numbers a row, and C, of `stride`, at those addresses."""
-    sizes = np.array([columns, rows, q, stride, n], dtype=np.int32)
-    at, chars, numbers = sizes.ctypes.data, _TRANS_NO.ctypes.data, _MINUS_ONE_ONE.ctypes.data
-    _dgemm(chars, chars + 1, at, at + 4, at + 8, numbers, R, at + 16, L, at + 16, numbers + 8, C, at + 12)
-    sizes[0] = rows  # keeps them alive until the call is over
+def subtract_product(C: int, stride: int, L: int, rows: int, R: int, columns: int, q: int, n: int, outer: bool) -> None:
+    """C -= L R' for L (rows, q) and R (columns, q), or, if `outer`, C -= L' R for L (q, rows) and R (q, columns).
 
-
-@compiled
-def subtract_outer(C: int, stride: int, L: int, rows: int, R: int, columns: int, q: int, n: int) -> None:
-    """C -= L' R for L (q, rows) and R (q, columns), of n numbers a row, and C, of `stride`, at those addresses."""
+    L and R, of n numbers a row, and C, of `stride`, are at those addresses.
+    """
     sizes = np.array([columns, rows, q, stride, n], dtype=np.int32)
-    at, chars, numbers = sizes.ctypes.data, _TRANS_NO.ctypes.data + 1, _MINUS_ONE_ONE.ctypes.data
+    at, chars, numbers = sizes.ctypes.data, _TRANS_NO.ctypes.data + outer, _MINUS_ONE_ONE.ctypes.data
     _dgemm(chars, chars + 1, at, at + 4, at + 8, numbers, R, at + 16, L, at + 16, numbers + 8, C, at + 12)
     sizes[0] = rows  # keeps them alive until the call is over
 

@@ -14,6 +14,7 @@ from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
 from kalmark.filter.corrections import call_generator
+from kalmark.geometry.matrices import product
 from kalmark.geometry.rotations import matrix
 from kalmark.geometry.spaces import HOMOGENEOUS, KIND, P_AT, Table
 from kalmark.models.observe import step
@@ -58,7 +59,7 @@ def append_constants(
                 Q_all[i, j] = Q[i, j]
         for j in range(m, c):
             F_all[i, n + j] = R_a[i, j]
-    R_N = kernels.product(R_u, N)
+    R_N = product(R_u, N)
     for j in range(m):
         F_all[n + j, n + j] = 0.0
         for i in range(n):
@@ -139,7 +140,7 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     Q, valid = kernels.moved_noise(moved, F, R_u, N)  # the last term of [S] (15)
     if not valid:
         return False
-    F, Q = append_constants(F, kernels.product(R_u, B), R_u, N, Q, shared, begins)
+    F, Q = append_constants(F, product(R_u, B), R_u, N, Q, shared, begins)
     if len(D):
         Q_D = noise_in_world(moved, D)
         for i in range(len(D)):

@@ -14,6 +14,7 @@ from kalmark.compiled import compiled
 from kalmark.declare import Estimated, NotNegative, declared
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
 from kalmark.geometry.frames import compose
+from kalmark.geometry.matrices import product
 from kalmark.geometry.spaces import SE2
 from kalmark.models.observe import Compiled
 
@@ -60,17 +61,6 @@ def velocity_step(v: Array, dt: float) -> tuple[Array, Array]:
     S_v[1, 0], S_v[1, 1], S_v[1, 2] = dt * q, dt * p, dt * (x * q_a + y * p_a)
     S_v[2, 2] = dt
     return step, S_v
-
-
-@compiled
-def product(A: Array, B: Array) -> Array:
-    """Return A B of two matrices (a, b) and (b, c)."""
-    out = np.zeros((A.shape[0], B.shape[1]))
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
-            for k in range(A.shape[1]):
-                out[i, j] += A[i, k] * B[k, j]
-    return out
 
 
 @compiled

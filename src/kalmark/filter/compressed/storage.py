@@ -98,7 +98,7 @@ def subtract(panel: Stored, L: Array, R: Array, first: int, last: int, widths: I
         end, width = min(start + PANEL, last), widths[start // PANEL]
         if panel.itemsize == 8:
             r, c = R.ctypes.data + start * R.strides[0], panel.ctypes.data + start * panel.itemsize
-            subtract_product(c, panel.shape[1], L.ctypes.data, len(L), r, end - start, width, L.shape[1])
+            subtract_product(c, panel.shape[1], L.ctypes.data, len(L), r, end - start, width, L.shape[1], False)
         else:
             product = np.ascontiguousarray(L[:, :width]) @ np.ascontiguousarray(R[start:end, :width]).T
             for i in range(len(L)):
