@@ -47,26 +47,20 @@ def velocity_of_plane(r: Array, par: Array) -> tuple[Array, Array]:
 @compiled
 def coast_ahead(r: Array, u: Array, par: Array, dt: float) -> tuple[Array, Array, Array]:
     """Move r (5,) for dt s at its own speed and turn rate (v, w), which u (2,) then changes; R_r (5, 5), R_u (5, 2)."""
-    moved, R_r, R_u, v = r.copy(), np.eye(5), np.zeros((5, 2)), np.zeros(3)
-    v[0], v[2] = r[3], r[4]
-    pose, P_r, P_v = screw(r[:3].copy(), v, dt)
-    for i in range(3):
-        moved[i], R_r[i, 3], R_r[i, 4] = pose[i], P_v[i, 0], P_v[i, 2]
-        for j in range(3):
-            R_r[i, j] = P_r[i, j]
-    for i in range(2):
-        moved[3 + i] += u[i]
-        R_u[3 + i, i] = 1.0
-    return moved, R_r, R_u
+    state, change = np.zeros(6), np.zeros(3)
+    state[ALONG_AND_TURN] = r
+    change[0], change[2] = u[0], u[1]
+    moved, R_r, R_u = coast_in_plane(state, change, par, dt)
+    return moved[ALONG_AND_TURN], R_r[ALONG_AND_TURN][:, ALONG_AND_TURN], R_u[ALONG_AND_TURN][:, ALONG_AND_TURN[3:] - 3]
 
 
 @compiled
 def velocity_ahead(r: Array, par: Array) -> tuple[Array, Array]:
     """Return the velocity (v, 0, w) of a state r (5,) in the robot's frame, and its Jacobian (3, 5)."""
-    b, B_r = np.zeros(3), np.zeros((3, 5))
-    b[0], b[2] = r[3], r[4]
-    B_r[0, 3] = B_r[2, 4] = 1.0
-    return b, B_r
+    state = np.zeros(6)
+    state[ALONG_AND_TURN] = r
+    b, B_r = velocity_of_plane(state, par)
+    return b, B_r[:, ALONG_AND_TURN]
 
 
 @register("motion", "constant_velocity")
