@@ -27,6 +27,7 @@ from kalmark.config.tree import name_on
 from kalmark.errors import DivergedError, EventError, KalmarkError
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.geometry.angles import wrap
+from kalmark.geometry.pose_frames import body_axes
 from kalmark.geometry.spaces import SE2
 from kalmark.logs.log import Log, Trajectory
 from kalmark.logs.progress import track
@@ -46,7 +47,6 @@ from kalmark.simulate.robots import (
     draw_start,
     given_control,
 )
-from kalmark.simulate.routes import body_axes
 from kalmark.simulate.sights import (
     POINTS,
     exact_measurements,

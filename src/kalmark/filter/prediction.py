@@ -5,7 +5,6 @@ The same source runs twice, as in `corrections`: compiled for the built-in motio
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from kalmark.compiled import compiled
 from kalmark.filter import kernels
 from kalmark.filter.corrections import call_generator
 from kalmark.geometry.matrices import product
-from kalmark.geometry.rotations import matrix
+from kalmark.geometry.pose_frames import body_axes
 from kalmark.geometry.spaces import HOMOGENEOUS, KIND, P_AT, Table
 from kalmark.models.observe import step
 
@@ -26,19 +25,7 @@ Motion = tuple[Any, int, Index, bool, bool, Array, Array, Array, Array, float]  
 @compiled
 def noise_in_world(state: Array, D: Array) -> Array:
     """Return a noise D (k, k) of the robot's frame in the world's: in the plane (3 or more), in space (6 or more)."""
-    k = len(D)
-    G = np.eye(k)
-    if len(state) < 7:
-        G[0, 0] = G[1, 1] = math.cos(state[2])
-        G[1, 0] = math.sin(state[2])
-        G[0, 1] = -G[1, 0]
-    else:
-        Q = matrix(state[3:7])
-        for i in range(0, min(9, k), 3):  # position, orientation, velocity; a body rate is in the robot's frame anyway
-            for a in range(3):
-                for b in range(3):
-                    G[i + a, i + b] = Q[a, b]
-    return kernels.quadratic(G, D)
+    return kernels.quadratic(body_axes(state, len(D)), D)
 
 
 @compiled

@@ -2,11 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
+from kalmark.arrays import Array
+from kalmark.compiled import compiled
 from kalmark.geometry import frames, frames3d
+from kalmark.geometry.rotations import matrix
 
 FRAMES: dict[int, Any] = {3: frames, 7: frames3d}
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
+
+
+@compiled
+def body_axes(state: Array, size: int) -> Array:
+    """Return the matrix (size, size) from errors in the frame of a robot to the world's, by its state.
+
+    In the plane (3 or more,), in space (7 or more,): of the position, the orientation and the velocity.  A velocity in
+    the plane and the rates of a body are in the robot's frame anyway.
+    """
+    G = np.eye(size)
+    if len(state) < 7:
+        G[0, 0] = G[1, 1] = math.cos(state[2])
+        G[1, 0] = math.sin(state[2])
+        G[0, 1] = -G[1, 0]
+        return G
+    Q = matrix(state[3:7])
+    for at in range(0, min(size, 9), 3):
+        for i in range(3):
+            for j in range(3):
+                G[at + i, at + j] = Q[i, j]
+    return G

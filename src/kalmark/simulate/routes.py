@@ -18,8 +18,9 @@ from kalmark.arrays import Array
 from kalmark.compiled import address_of, by_address, compiled, python_form, signature_of
 from kalmark.config.sections import Numbers, OneOf, Section
 from kalmark.declare import NotNegative, Positive
-from kalmark.geometry.angles import rotation, wrap
+from kalmark.geometry.angles import wrap
 from kalmark.geometry.frames import compose
+from kalmark.geometry.pose_frames import body_axes
 from kalmark.geometry.rotations import left_jacobian, matrix
 from kalmark.models.motion import (
     Ackermann,
@@ -307,15 +308,3 @@ def disturb_state(motion: Any, state: Array, d: Array) -> Array:
     step = np.zeros(motion.space.dof)
     step[: len(d)] = body_axes(state, len(d)) @ d
     return np.asarray(motion.space.plus(state, step))
-
-
-def body_axes(state: Array, size: int) -> Array:
-    """Return the matrix (size, size) from errors in the robot's frame to the world's; rates stay in the body's."""
-    G = np.eye(size)
-    if len(state) < 7:  # a velocity behind a pose of the plane is in the robot's frame anyway
-        G[:2, :2] = rotation(state[2])
-        return G
-    Q = matrix(state[3:7].copy())
-    for at in range(0, min(size, 9), 3):
-        G[at : at + 3, at : at + 3] = Q
-    return G
