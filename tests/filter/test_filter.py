@@ -19,6 +19,7 @@ from kalmark.filter.estimators import Movement, Update
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.textbook import TextbookSlam
 from kalmark.geometry import POINT2, SE2, Rn
+from kalmark.models.observe import PythonView
 
 J = np.array([[0.0, -1.0], [1.0, 0.0]])
 ESTIMATORS = [km.estimators.Ekf(), km.estimators.Invariant(), km.estimators.Fej()]
@@ -287,7 +288,7 @@ def test_a_known_map_stays_as_it_is_and_locates_the_robot() -> None:
 
 
 def test_the_plain_python_source_of_a_correction_equals_the_compiled_one() -> None:
-    for fast, last in ((corrections.invariant, (6, 1e-3)), (corrections.textbook, None)):
+    for fast in (corrections.invariant, corrections.textbook, corrections.first_estimates):
         maps = []
         for function in (python_form(fast), fast):
             slam = km.Slam([robot()])
@@ -295,10 +296,32 @@ def test_the_plain_python_source_of_a_correction_equals_the_compiled_one() -> No
                 slam.process(event)
             m, slots, y = slam.map, np.array([slam.slot(i) for i in (1, 2, 3)]), np.full((3, 2), 2.0)
             view, R3 = slam.state.channels["r", "lidar"].models["point"].model, np.tile(R, (3, 1, 1))
+            last = {corrections.invariant: (6, 1e-3), corrections.first_estimates: m.x_first}.get(fast)
             function(view, m.whole, (0, -1, slots, 2, y, R3, np.inf), last)
             maps.append((m.x[: m.n].copy(), full(m)))
         np.testing.assert_allclose(maps[0][0], maps[1][0], atol=1e-9)
         np.testing.assert_allclose(maps[0][1], maps[1][1], atol=1e-9)
+
+
+def test_a_scan_is_linearised_alike_by_a_compiled_model_and_by_a_model_in_python() -> None:
+    slam = km.Slam([robot()])
+    for event in drive(20, 13, WORLD):
+        slam.process(event)
+    model, slots = slam.state.channels["r", "lidar"].models["point"], np.array([slam.slot(i) for i in (1, 2, 3)])
+    scan = 0, -1, slots, 2, np.full((3, 2), 2.0), np.tile(R, (3, 1, 1)), np.inf
+    in_python = PythonView(model.sensor, model.landmark, model.at, np.array(model.sensor.angular))
+    fast, plain = (corrections.seen_at(view, slam.map.whole, scan) for view in (model.model, in_python))
+    e, E_r, E_l = km.geometry.observe(slam.mean("r"), np.array([slam.mean(i) for i in (1, 2, 3)]))
+    for found, again, expected in zip(fast, plain, (None, e, None, E_r, E_l), strict=True):
+        np.testing.assert_allclose(found, again, atol=1e-12)
+        if expected is not None:
+            np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_array_equal(fast[0], [*range(3), *np.concatenate([slam.map.index(s) for s in slots])])
+    covariances = corrections.innovation_covariances
+    for found, again in zip(
+        *(f(model.model, slam.map.whole, scan) for f in (covariances, python_form(covariances))), strict=True
+    ):
+        np.testing.assert_allclose(found, again, rtol=1e-12)
 
 
 # ---------------------------------------------------------------------- the map itself

@@ -401,15 +401,22 @@ def fuse_scan(
         )
 
 
+@compiled_by_model
+def seen_at(model: Any, map_: Map, scan: Scan) -> tuple[Index, Array, Array, Array, Array]:
+    """Return the rows in P of the block that a scan observes, and e, z, E_h and E_l at its mean, as `linearize`."""
+    x, _P, _n, blocks, atoms, _axes, _ways = map_
+    robot, mount, slots, d, y, _R, _gate = scan
+    index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
+    head = head_sizes(blocks, atoms, robot, mount)[1]
+    e, z, E_h, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
+    return index, e, z, E_h, E_l
+
+
 @compiled
 def innovation_covariances(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array]:
     """Return each observation's innovation covariance Z (K, p, p) and d2 (K,); nothing is corrected.  [S] (83)."""
-    x, P, _n, blocks, atoms, _axes, _ways = map_
-    robot, mount, slots, d, y, R, _gate = scan
-    index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
-    head = head_sizes(blocks, atoms, robot, mount)[1]
-    _e, z, E_h, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
-    Z, d2, _valid = innovation(P, index, E_h, E_l, R, z)
+    index, _e, z, E_h, E_l = seen_at(model, map_, scan)
+    Z, d2, _valid = innovation(map_[1], index, E_h, E_l, scan[5], z)
     return Z, d2
 
 
@@ -422,15 +429,13 @@ def robust_noise(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     Statistical Association 84.  Iterated least squares on the scan as it is linearised at the prediction, with the
     covariance of the prior.
     """
-    x, P, _n, blocks, atoms, _axes, _ways = map_
-    robot, mount, slots, d, y, R, k = scan
-    index, _table, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
-    head, p = head_sizes(blocks, atoms, robot, mount)[1], R.shape[1]
-    _e, z, E_r, E_l = linearize(model, mean[:head], mean[head:].reshape(len(slots), d), y)
+    index, _e, z, E_r, E_l = seen_at(model, map_, scan)
+    y, R, k = scan[4:]
+    p = R.shape[1]
     for i in range(len(y)):
         if np.isnan(z[i]).any():  # it has no expectation: it does not change the others
             z[i], E_r[i], E_l[i] = 0.0, 0.0, 0.0
-    P_ss, H, v, inflated = submatrix(P, index), stack_jacobians(E_r, E_l, len(index)), ravel(z), R.copy()
+    P_ss, H, v, inflated = submatrix(map_[1], index), stack_jacobians(E_r, E_l, len(index)), ravel(z), R.copy()
     r = np.empty((len(y), p))
     for _ in range(ROUNDS):
         HP, Z = joint_innovation(H, P_ss, inflated, E_r.shape[2])
@@ -562,13 +567,10 @@ def first_estimates(
     model: Any, map_: Map, scan: Scan, x_first: Array
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
     """Correct with one scan, innovation at the estimate, Jacobians at the first estimates `x_first`."""
-    x, P, n, blocks, atoms, _axes, ways = map_
-    robot, mount, slots, d, y, R, gate = scan
-    k, head = len(slots), head_sizes(blocks, atoms, robot, mount)[1]
-    index, _, mean = observed_block(x, blocks, atoms, robot, mount, slots, d)
-    _, _, first = observed_block(x_first, blocks, atoms, robot, mount, slots, d)
-    e, z, _, _ = linearize(model, mean[:head], mean[head:].reshape(k, d), y)
-    _, _, E_r, E_l = linearize(model, first[:head], first[head:].reshape(k, d), y)
+    x, P, n, blocks, atoms, axes, ways = map_
+    robot, mount, slots, d, _y, R, gate = scan
+    index, e, z, _E_r, _E_l = seen_at(model, map_, scan)
+    _index, _e, _z, E_r, E_l = seen_at(model, (x_first, P, n, blocks, atoms, axes, ways), scan)
     Z, d2, valid = innovation(P, index, E_r, E_l, R, z)
     near, count = within_gate(d2, gate)
     if count == 0:

@@ -9,11 +9,10 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
-from kalmark.filter.corrections import Map
+from kalmark.filter.corrections import Map, seen_at
 from kalmark.filter.kernels import cholesky_inverse
 from kalmark.filter.nearest_blocks import Sorts, distance, nearest_pairs, wanted_places
-from kalmark.filter.observed_block import head_sizes, innovation, observed_block
-from kalmark.models.observe import linearize
+from kalmark.filter.observed_block import innovation
 
 Seen = tuple[int, int, int, Array, Array]  # slots of robot and mount, numbers of a landmark, y (K, m), R (K, p, p)
 Asked = tuple[Sorts, Array, int, float, float]  # wanted sorts, places, most, farther, gate: see `nearest_landmarks`
@@ -47,10 +46,9 @@ def nearest_landmarks(
     an observation, which seems to be at its p (K, n), the `most` nearest in metres are compared, within `farther` times
     the least distance.
     """
-    x, P, _n, blocks, atoms, _axes, _ways = map_
     robot, mount, d, y, R = scan
     sorts, p, most, farther, gate = asked
-    here, places = wanted_places(x, blocks, slots, sorts, p.shape[1])
+    here, places = wanted_places(map_[0], map_[3], slots, sorts, p.shape[1])
     rows, numbers, used = nearest_pairs(p, places, most, farther)
     named, l = np.empty(len(used), np.int64), np.empty((len(used), p.shape[1]))
     for i in range(len(used)):
@@ -58,10 +56,8 @@ def nearest_landmarks(
         for j in range(p.shape[1]):
             l[i, j] = places[used[i], j]
     own, y_own, R_own = _of_pairs(rows, numbers, here, used, y, R)
-    index, _table, mean = observed_block(x, blocks, atoms, robot, mount, own, d)
-    head = head_sizes(blocks, atoms, robot, mount)[1]
-    _e, z, E_h, E_l = linearize(model, mean[:head], mean[head:].reshape(len(rows), d), y_own)
-    Z, compared, _valid = innovation(P, index, E_h, E_l, R_own, z)
+    index, _e, z, E_h, E_l = seen_at(model, map_, (robot, mount, own, d, y_own, R_own, gate))
+    Z, compared, _valid = innovation(map_[1], index, E_h, E_l, R_own, z)
     best, limit = _best_pairs(p, rows, numbers, compared, l, most, farther)
     at, d2, sigma, clear = np.full(len(p), -1), np.full(len(p), np.inf), np.full(len(p), np.inf), True
     for k in range(len(p)):
