@@ -7,7 +7,7 @@ landmarks are in view, what is expected of them and how uncertain that is.  It i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from kalmark.models import protocols
 from kalmark.models.observe import linearize, sensor_pose
 from kalmark.report import Expectations
 from kalmark.tracks.channel import Channel, ObservationModel, landmarks_in_frame
-from kalmark.tracks.track import Track, Tracks
+from kalmark.tracks.track import Tracks
 
 QUATERNION_AT = 6  # where the w of a pose is
 UNMEASURED = "its size has not been measured"
@@ -43,6 +43,18 @@ class Linearised(NamedTuple):
     E_l: Array
 
 
+class _OneModel(NamedTuple):
+    """Landmarks of one model: the indices of their names, l (K, n), extents, sizes, and what `linearise` takes."""
+
+    model: ObservationModel
+    group: list[int]
+    l: Array
+    extents: list[Array | None]
+    sizes: list[float | None]
+    linearise: Callable[..., Linearised]
+    of: Array | Index  # l or the slots (K,)
+
+
 def expectations(
     map_: Map, tracks: Tracks, channel: Channel, robot: str, sensor: str, names: Sequence[Id] | None = None,
     only_in_view: bool = False,
@@ -55,29 +67,16 @@ def expectations(
     in_view = np.zeros(count, dtype=np.bool_)
     why: list[str | None] = [None] * count
     found: list[tuple[Index, Linearised]] = []
-    for model, group in tracks.by_model(channel, names, robot):
-        rows = np.array(group)
-        slots = tracks.slots_of([names[i] for i in group])
-        of = [tracks.confirmed.get(names[i]) for i in group]
-        seen = visible_blocks(map_, channel, slot, model, slots, of, reasons=not only_in_view)
+    for model, group, l, extents, sizes, linearise, of in _by_model(map_, tracks, channel, robot, names):
+        rows, T = np.array(group), channel.pose(map_, slot)
+        seen = visible_landmarks(channel, model, T, l, extents, sizes, reasons=not only_in_view)
         for i, reason in zip(group, seen.why, strict=True):
             why[i] = reason
         in_view[rows] = seen.in_view
         chosen = np.flatnonzero(seen.in_view) if only_in_view else np.arange(len(rows))
         for at in range(0, len(chosen), AT_ONCE):  # a joint marginal is dense
             some = chosen[at : at + AT_ONCE]
-            found.append((rows[some], linearize_blocks(map_, channel, slot, model, slots[some], seen.y[some])))
-    for model, group in tracks.known_by_model(channel, names):
-        rows, known = np.array(group), [names[i] for i in group]
-        l = tracks.known.means(known, model.d)
-        extents = [tracks.known.extent(name) for name in known]
-        seen = visible_landmarks(channel, model, channel.pose(map_, slot), l, extents, reasons=not only_in_view)
-        for i, reason in zip(group, seen.why, strict=True):
-            why[i] = reason
-        in_view[rows] = seen.in_view
-        chosen = np.flatnonzero(seen.in_view) if only_in_view else np.arange(len(rows))
-        if len(chosen):
-            found.append((rows[chosen], linearised_known(map_, channel, slot, model, l[chosen], seen.y[chosen])))
+            found.append((rows[some], linearise(map_, channel, slot, model, of[some], seen.y[some])))
     if channel.sees_velocity:  # of a state, the pose in it, too; a clone is not where the robot is
         twice = 1 if channel.counts else 2
         found = [(rows, part._replace(E_h=_in_pose(part.E_h, channel.pose_dof, twice))) for rows, part in found]
@@ -100,6 +99,20 @@ def expectations(
     )  # fmt: skip
 
 
+def _by_model(map_: Map, tracks: Tracks, channel: Channel, robot: str, names: Sequence[Id]) -> Iterator[_OneModel]:
+    """Yield the named landmarks by their models: those in the map, then those known exactly."""
+    for model, group in tracks.by_model(channel, names, robot):
+        slots = tracks.slots_of([names[i] for i in group])
+        of = [tracks.confirmed.get(names[i]) for i in group]
+        extents = [None if track is None else track.extent for track in of]
+        sizes = [None if track is None else track.size_m for track in of]
+        yield _OneModel(model, group, map_.means(slots, model.d), extents, sizes, linearize_blocks, slots)
+    for model, group in tracks.known_by_model(channel, names):
+        known = [names[i] for i in group]
+        l, extents = tracks.known.means(known, model.d), [tracks.known.extent(name) for name in known]
+        yield _OneModel(model, group, l, extents, [None] * len(known), linearised_known, l)
+
+
 def _in_pose(E_h: Array, dof: int, times: int) -> Array:
     """Return the Jacobian (K, p, dof) in a robot's pose, with which so many blocks of the columns of E_h begin."""
     E_r: Array = sum((E_h[:, :, k * dof : (k + 1) * dof] for k in range(times)), np.zeros((*E_h.shape[:2], dof)))
@@ -120,21 +133,9 @@ def _not_observed(channel: Channel, tracks: Tracks, name: Id, robot: str) -> str
 
 
 # ---------------------------------------------------------------------- in view
-def visible_blocks(
-    map_: Map, channel: Channel, robot: int, model: ObservationModel, slots: Index, tracks: Sequence[Track | None],
-    reasons: bool = True,
-) -> Looked:  # fmt: skip
-    """Return which blocks of a kind are in view, and measurements to linearise at; `reasons`: why others are not."""
-    T, l = channel.pose(map_, robot), map_.means(slots, model.d)
-    sizes = [None if track is None else track.size_m for track in tracks]
-    return visible_landmarks(
-        channel, model, T, l, [None if track is None else track.extent for track in tracks], sizes, reasons
-    )
-
-
 def visible_landmarks(
     channel: Channel, model: ObservationModel, T: Array, l: Array, extents: Sequence[Array | None],
-    sizes: Sequence[float | None] = (), reasons: bool = True,
+    sizes: Sequence[float | None], reasons: bool,
 ) -> Looked:  # fmt: skip
     """Return which landmarks l (K, n) of one kind are in view from the pose T, and measurements to linearise at.
 
@@ -156,7 +157,7 @@ def visible_landmarks(
     if "qw" in columns:
         y[:, QUATERNION_AT] = 1.0
     if "size_m" in columns:
-        y[:, -1] = [math.nan if size is None else size for size in sizes or [None] * len(l)]
+        y[:, -1] = [math.nan if size is None else size for size in sizes]
         unmeasured = np.isnan(y[:, -1]).tolist()
         why = [reason or (UNMEASURED if lacks else "") for reason, lacks in zip(why, unmeasured, strict=True)]
         in_view = in_view & ~np.array(unmeasured, dtype=np.bool_)
