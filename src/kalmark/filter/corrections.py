@@ -7,8 +7,7 @@ its sensor's mount (-1: not in the map), the slots of K landmarks of which the f
 (K, m) with the noise R (K, p, p) of their innovations, and the gate on d2.  The head of the observed block is the
 robot's pose and, if it is in the map, the mount.  Nothing is changed unless all of it succeeds.
 
-A function that is called by address is compiled once, alone, and only if a map uses it.  Compiled code
-here indexes its arrays: slices, products and fancy indices are what takes numba long.
+A function that is called by address is compiled once, alone, and only if a map uses it.
 """
 
 from __future__ import annotations
@@ -60,7 +59,6 @@ from kalmark.filter.observed_block import (
     least_squares,
     observation_of,
     observed_block,
-    ravel,
     sparse_product,
     squared_distances,
     stack_jacobians,
@@ -142,15 +140,6 @@ def compile_correction(name: str, option: str, axes: int, inverse_depths: bool, 
     routines(axes, inverse_depths, dependent)
 
 
-@compiled
-def take_entries(values: Any, rows: Index) -> Any:
-    """Return values[rows]."""
-    out = np.empty(len(rows), values.dtype)
-    for i in range(len(rows)):
-        out[i] = values[rows[i]]
-    return out
-
-
 @compiled_by_model
 def predicted(model: Any, map_: Map, scan: Scan) -> tuple[Array, Array, Block, Linear]:
     """Return e and z of each observation, the block that a scan observes, and the scan linearised at the block's mean.
@@ -187,8 +176,8 @@ def coordinates(
     it.  docs/invariant.md, docs/bearing_only.md.
     """
     (turning, sizes), (table, rows, places, x, n) = turns, placed
-    axes, h, head = sizes[2], sizes[3], take_entries(x, places)
-    theta, R_r = take_entries(rows, turning[0]), rotation_at(x, places[0], axes)
+    axes, h, head = sizes[2], sizes[3], x[places]
+    theta, R_r = rows[turning[0]], rotation_at(x, places[0], axes)
     B = take_rows(P, theta, n)
     L = call_regression(ways[_REGRESSION], (B, theta, table, turning, axes, R_r, ways[_SPREAD] != 0))
     generator = call_generator(ways[_GENERATOR], (table, x, n, axes, head))
@@ -211,10 +200,10 @@ def retract_in(
     """
     (table, rows, places, before, n), head, theta, L, R_r, then, baselines, (turning, sizes) = prior
     axes, h, level = sizes[2], sizes[3], sizes[5]
-    own = take_entries(correction, rows)
+    own = correction[rows]
     turn = gauge(head, own, turning, axes)
     step = call_heading_last(ways[_HEADING_LAST], (correction, turn, level, rows[0] + 3))  # the row of the rotation
-    E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, take_entries(step, rows), turning, axes))
+    E, W, d = call_turn_matrices(ways[_TURN_MATRICES], (turn, step[rows], turning, axes))
     call_retract(ways[_RETRACT], (table, x, step, turn))
     call_carry(ways[_CARRY], (table, x, L, W, d))
     now = call_generator(ways[_GENERATOR], (table, x, n, axes, head))
@@ -222,7 +211,7 @@ def retract_in(
     a = call_displacement(ways[_DISPLACEMENT], moved)
     s, S = baselines[1], baselines[2]
     if len(baselines[0]):
-        s, S = sensor_at(model, take_entries(x, places), ways[_SENSOR_AT])
+        s, S = sensor_at(model, x[places], ways[_SENSOR_AT])
         parallax.call_retract(ways[_RETRACT_PARALLAX], (x, before, baselines, correction, own[:h], s))
     return a, s, S
 
@@ -260,7 +249,7 @@ def iterate(
             a, s, S = retract_in(model, ways, prior, x_j, correction)
             _e, z, E_r, E_l = linearize(model, x_j[:head], x_j[head:].reshape(k, (len(mean) - head) // k), y)
             cost = cost_of(z, R, correction, weights)
-            H, v = stack_jacobians(E_r, E_l, n), ravel(z)
+            H, v = stack_jacobians(E_r, E_l, n), z.ravel()
             if len(baselines[0]):
                 parallax.call_carry_back(ways[_CARRY_BACK], (H, mean, x_j, baselines, s, S))
             transport_rows(H, v, a, prior.theta, correction)
@@ -338,25 +327,6 @@ def product_left(E_r: Array, E_l: Array, rows: Array, at: int, V: Array, index: 
 
 
 @compiled
-def near_scan(scan: Scan, near: Flags, count: int) -> Scan:
-    """Return the scan with those `count` observations alone that are `near` (K,)."""
-    robot, mount, slots, d, y, R, gate = scan
-    p = R.shape[1]
-    slots_near, y_near, R_near = np.empty(count, np.int64), np.empty((count, y.shape[1])), np.empty((count, p, p))
-    to = 0
-    for i in range(len(near)):
-        if near[i]:
-            slots_near[to] = slots[i]
-            for a in range(y.shape[1]):
-                y_near[to, a] = y[i, a]
-            for a in range(p):
-                for b in range(p):
-                    R_near[to, a, b] = R[i, a, b]
-            to += 1
-    return robot, mount, slots_near, d, y_near, R_near, gate
-
-
-@compiled
 def invariant(
     model: Any, map_: Map, scan: Scan, limits: tuple[int, float]
 ) -> tuple[Array, Array, Array, Array, Flags, bool]:  # fmt: skip
@@ -372,7 +342,8 @@ def invariant(
     if count == 0:
         return e, z, Z, d2, near, valid
     if count < len(near):
-        scan = near_scan(scan, near, count)
+        robot, mount, slots, d, y, R, gate = scan
+        scan = robot, mount, slots[near], d, y[near], R[near], gate
         _e, _z, block, linear = predicted(model, map_, scan)
     H, M, v, positive = iterated(model, map_[6], block, scan[4], scan[5], linear, limits)
     if not positive:
@@ -435,7 +406,7 @@ def robust_noise(model: Any, map_: Map, scan: Scan, student: bool) -> Array:
     for i in range(len(y)):
         if np.isnan(z[i]).any():  # it has no expectation: it does not change the others
             z[i], E_r[i], E_l[i] = 0.0, 0.0, 0.0
-    P_ss, H, v, inflated = submatrix(map_[1], index), stack_jacobians(E_r, E_l, len(index)), ravel(z), R.copy()
+    P_ss, H, v, inflated = submatrix(map_[1], index), stack_jacobians(E_r, E_l, len(index)), z.ravel(), R.copy()
     r = np.empty((len(y), p))
     for _ in range(ROUNDS):
         HP, Z = joint_innovation(H, P_ss, inflated, E_r.shape[2])

@@ -19,7 +19,6 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter.kernels import RAISED, cholesky_inverse
-from kalmark.filter.observed_block import transpose
 from kalmark.geometry.angles import exponential_v
 from kalmark.geometry.matrices import product
 from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
@@ -254,7 +253,7 @@ def inverse_covariance(B: Array, index: Index, first: int) -> Array:
             S[i, j] = B[first + i, index[first + j]]
         S[i, i] += RAISED * max(S[i, i], 1.0)
     M, positive = cholesky_inverse(S)
-    return product(transpose(M), M) if positive else np.zeros(S.shape)
+    return product(np.ascontiguousarray(M.T), M) if positive else np.zeros(S.shape)
 
 
 @compiled
@@ -351,7 +350,7 @@ def displacement_columns(
                 out[i, axes + c] += out[i, axes - turns + a] * R[a, c]
             out[index[axes - turns + a], axes + c] -= R_now[a, c] - R[a, c]
     if level:
-        E_z = about_vertical(product(R_now, transpose(R)))
+        E_z = about_vertical(product(R_now, np.ascontiguousarray(R.T)))
         for a in range(3):
             for b in range(3):
                 out[index[axes - 3 + a], axes - 3 + b] += E_z[a, b] - (1.0 if a == b else 0.0)

@@ -50,14 +50,10 @@ def nearest_landmarks(
     sorts, p, most, farther, gate = asked
     here, places = wanted_places(map_[0], map_[3], slots, sorts, p.shape[1])
     rows, numbers, used = nearest_pairs(p, places, most, farther)
-    named, l = np.empty(len(used), np.int64), np.empty((len(used), p.shape[1]))
-    for i in range(len(used)):
-        named[i] = slots[here[used[i]]]
-        for j in range(p.shape[1]):
-            l[i, j] = places[used[i], j]
-    own, y_own, R_own = _of_pairs(rows, numbers, here, used, y, R)
-    index, _e, z, E_h, E_l = seen_at(model, map_, (robot, mount, own, d, y_own, R_own, gate))
-    Z, compared, _valid = innovation(map_[1], index, E_h, E_l, R_own, z)
+    named, l = slots[here[used]], places[used]
+    pairs = robot, mount, here[used[numbers]], d, y[rows], R[rows], gate
+    index, _e, z, E_h, E_l = seen_at(model, map_, pairs)
+    Z, compared, _valid = innovation(map_[1], index, E_h, E_l, pairs[5], z)
     best, limit = _best_pairs(p, rows, numbers, compared, l, most, farther)
     at, d2, sigma, clear = np.full(len(p), -1), np.full(len(p), np.inf), np.full(len(p), np.inf), True
     for k in range(len(p)):
@@ -67,23 +63,6 @@ def nearest_landmarks(
         if clear:
             sigma[k] = _sigma(E_l[best[k]], Z[best[k]])
     return clear, (at, d2, sigma, limit, rows, numbers, compared, named, l)
-
-
-@compiled
-def _of_pairs(
-    rows: Index, numbers: Index, here: Index, used: Index, y: Array, R: Array
-) -> tuple[Index, Array, Array]:  # fmt: skip
-    """Return the blocks (M,) of pairs, their measurements (M, m) and noises (M, p, p)."""
-    own, p = np.empty(len(rows), np.int64), R.shape[1]
-    y_own, R_own = np.empty((len(rows), y.shape[1])), np.empty((len(rows), p, p))
-    for m in range(len(rows)):
-        own[m] = here[used[numbers[m]]]
-        for a in range(y.shape[1]):
-            y_own[m, a] = y[rows[m], a]
-        for a in range(p):
-            for b in range(p):
-                R_own[m, a, b] = R[rows[m], a, b]
-    return own, y_own, R_own
 
 
 @compiled

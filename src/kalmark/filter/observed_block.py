@@ -196,37 +196,16 @@ def observation_of(z: Array, E_r: Array, E_l: Array, P_ss: Array, R: Array) -> L
     k, _p, d = E_l.shape
     H = stack_jacobians(E_r, E_l, len(P_ss))
     HP, Z = joint_innovation(H, P_ss, R, len(P_ss) - k * d)
-    return ravel(z), H, HP, Z
-
-
-@compiled
-def ravel(z: Array) -> Array:
-    """Return innovations z (K, p) as one (K p,)."""
-    k, p = z.shape
-    v = np.empty(k * p)
-    for i in range(k):
-        for a in range(p):
-            v[i * p + a] = z[i, a]
-    return v
+    return z.ravel(), H, HP, Z
 
 
 @compiled
 def joint_innovation(H: Array, P_ss: Array, R: Array, head: int) -> tuple[Array, Array]:
     """Return H P and Z = H P H' + blockdiag(R) of all observations, R (K, p, p)."""
     HP = sparse_product(H, P_ss, head, len(R))
-    Z = sparse_product(H, transpose(HP), head, len(R))
+    Z = sparse_product(H, np.ascontiguousarray(HP.T), head, len(R))
     add_blocks(Z, R)
     return HP, Z
-
-
-@compiled
-def transpose(A: Array) -> Array:
-    """Return A' (n, m) of A (m, n)."""
-    out = np.empty((A.shape[1], len(A)))
-    for i in range(len(A)):
-        for j in range(A.shape[1]):
-            out[j, i] = A[i, j]
-    return out
 
 
 @compiled
@@ -261,9 +240,8 @@ def diagonal_blocks(Z: Array, p: int) -> Array:
     """Return the blocks (K, p, p) on the diagonal of Z (K p, K p)."""
     blocks = np.empty((len(Z) // p, p, p))
     for i in range(len(blocks)):
-        for a in range(p):
-            for b in range(p):
-                blocks[i, a, b] = Z[i * p + a, i * p + b]
+        own = slice(i * p, (i + 1) * p)
+        blocks[i] = Z[own, own]
     return blocks
 
 

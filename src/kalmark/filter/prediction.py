@@ -92,13 +92,6 @@ def spread_rays(P: Array, atoms: Table, Q: Array) -> None:
 
 
 @compiled
-def write_mean(x: Array, x_first: Array, at: int, mean: Array) -> None:
-    """Write the mean of a block after a motion, and its first estimate."""
-    for i in range(len(mean)):
-        x[at + i] = x_first[at + i] = mean[i]
-
-
-@compiled
 def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     """Move a robot in a map; return whether all of it is finite: if not, nothing has changed.
 
@@ -136,7 +129,8 @@ def predict(map_: Map, motion: Motion, from_first: bool, spreads: bool) -> bool:
     kernels.predict(P, n, index, F, Q)  # [S] (15)-(17)
     if spreads:
         spread_rays(P, atoms, Q)
-    write_mean(x, x_first, at, moved)
+    x[at : at + size] = x_first[at : at + size] = moved
     if begins:
-        write_mean(x, x_first, blocks[added[0], 0], np.zeros(len(u)))
+        first = blocks[added[0], 0]
+        x[first : first + len(u)] = x_first[first : first + len(u)] = 0.0
     return True

@@ -67,14 +67,8 @@ def with_distance(l: Array, rays: tuple[Array, Array, Array]) -> tuple[Array, Ar
     ray, R_T, R_l = rays
     k, n = l.shape
     v, V_T, V_l = np.empty((k, 4)), np.zeros((k, 4, 6)), np.zeros((k, 4, n))
-    for i in range(k):
-        v[i, 3], V_l[i, 3, n - 1] = l[i, n - 1], 1.0
-        for a in range(3):
-            v[i, a] = ray[i, a]
-            for c in range(6):
-                V_T[i, a, c] = R_T[i, a, c]
-            for c in range(n):
-                V_l[i, a, c] = R_l[i, a, c]
+    v[:, :3], v[:, 3] = ray, l[:, n - 1]
+    V_T[:, :3], V_l[:, :3], V_l[:, 3, n - 1] = R_T, R_l, 1.0
     return v, V_T, V_l
 
 

@@ -44,17 +44,10 @@ def with_attributes(a: Array, points: tuple[Array, Array, Array]) -> tuple[Array
     p, P_T, P_a = points
     if d == 2:
         return p, P_T, P_a
-    b, B_T, B_a = np.empty((k, d)), np.zeros((k, d, 3)), np.zeros((k, d, d))
-    for i in range(k):
-        for j in range(d):
-            if j >= 2:
-                b[i, j], B_a[i, j, j] = a[i, j], 1.0
-                continue
-            b[i, j] = p[i, j]
-            for c in range(3):
-                B_T[i, j, c] = P_T[i, j, c]
-            for c in range(2):
-                B_a[i, j, c] = P_a[i, j, c]
+    b, B_T, B_a = a.copy(), np.zeros((k, d, 3)), np.zeros((k, d, d))
+    b[:, :2], B_T[:, :2], B_a[:, :2, :2] = p, P_T, P_a
+    for j in range(2, d):
+        B_a[:, j, j] = 1.0
     return b, B_T, B_a
 
 

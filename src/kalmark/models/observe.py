@@ -319,13 +319,9 @@ def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
     _, _, H_0, L_0 = linearize(view, head[0], l[:1], y[:1])
     (p, columns), k = append_columns(H_0[0], L_0[0]).shape, len(y)
     z, E = np.empty((k, p)), np.empty((k, p, columns))
-    for i in range(k):  # element by element: numba compiles slices for a second more
+    for i in range(k):
         _, z_i, H_i, L_i = linearize(view, head[i], l[i : i + 1], y[i : i + 1])
-        E_i = append_columns(H_i[0], L_i[0])
-        for a in range(p):
-            z[i, a] = z_i[0, a]
-            for c in range(columns):
-                E[i, a, c] = E_i[a, c]
+        z[i], E[i] = z_i[0], append_columns(H_i[0], L_i[0])
     return z, E
 
 
@@ -413,15 +409,16 @@ def linearize_chain(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
     """
     _, links_at, _, _, look_at, expect_at, vary_at, velocity_at, code, at, par, angular, ago_at, _ = view
     own = head[2 * len(at) + (ago_at != 0) if vary_at != 0 else len(head) :]
-    measured, given = split_columns(y, len(angular))
+    measured, given = y[:, : len(angular)].copy(), y[:, len(angular) :].copy()
     v, V_T, T_h, V_l = call_links(links_at, (view, head, l, given))
-    par = with_first(par, own)
+    par = par.copy()
+    par[: len(own)] = own
     e, z, E_v = landmark_views.expect(expect_at, (code, par, angular, v, measured))
     E_h = multiply_by_one(multiply_many(E_v, V_T), T_h, len(own))
     if len(own) > 0:  # of a sensor of the state they are taken at the mean of earlier readings, where that is given
         usual = look_at == 0 and velocity_at == 0 and given.shape[1] > 1
-        at_e = split_columns(given, e.shape[1])[0] if usual else e
-        write_last_columns(E_h, landmark_views.vary(vary_at, (code, par, angular, v, at_e)))
+        at_e = given[:, : e.shape[1]].copy() if usual else e
+        E_h[:, :, E_h.shape[2] - len(own) :] = landmark_views.vary(vary_at, (code, par, angular, v, at_e))
     return append_columns(e, given), z, E_h, multiply_many(E_v, V_l)
 
 
@@ -479,42 +476,13 @@ def links_of_state(view: View, head: Array, l: Array, given: Array) -> Links:
 
 
 @compiled
-def split_columns(y: Array, m: int) -> tuple[Array, Array]:
-    """Return the first m columns of y (K, m + n) and the others."""
-    k, size = y.shape
-    if size == m:
-        return y, np.empty((k, 0))
-    first, others = np.empty((k, m)), np.empty((k, size - m))
-    for i in range(k):
-        for j in range(size):
-            if j < m:
-                first[i, j] = y[i, j]
-            else:
-                others[i, j - m] = y[i, j]
-    return first, others
-
-
-@compiled
-def with_first(a: Array, first: Array) -> Array:
-    """Return numbers a (n,), the first of them replaced by `first`."""
-    if len(first) == 0:
-        return a
-    out = a.copy()
-    for i in range(len(first)):
-        out[i] = first[i]
-    return out
-
-
-@compiled
 def append_columns(a: Array, b: Array) -> Array:
     """Return the columns of a (K, m) and behind them those of b (K, n)."""
     k, m = a.shape
     if b.shape[1] == 0:
         return a
     out = np.empty((k, m + b.shape[1]))
-    for i in range(k):
-        for j in range(out.shape[1]):
-            out[i, j] = a[i, j] if j < m else b[i, j - m]
+    out[:, :m], out[:, m:] = a, b
     return out
 
 
@@ -528,16 +496,6 @@ def multiply_by_one(E: Array, F: Array, more: int) -> Array:
                 for c in range(F.shape[1]):
                     out[i, a, c] += E[i, a, b] * F[b, c]
     return out
-
-
-@compiled
-def write_last_columns(E_h: Array, E_p: Array) -> None:
-    """Write E_p (K, p, c) into the last columns of E_h (K, p, h)."""
-    k, p, c = E_p.shape
-    for i in range(k):
-        for a in range(p):
-            for b in range(c):
-                E_h[i, a, E_h.shape[2] - c + b] = E_p[i, a, b]
 
 
 # ------------------------------------------------------------------ motions
