@@ -99,7 +99,7 @@ from typing import Any
 from unittest.mock import patch
 import numpy as np
 from kalmark.compiled import compiled
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import product
 
 A = np.arange(12.0).reshape(3, 4)
 
@@ -109,7 +109,7 @@ def anew():
     return sum(function.stats.cache_hits.values())
 
 assert anew() == 0 and anew() == 1
-index, data = sorted(Path(sys.argv[1]).rglob("matrices.product-*.nb*"), key=lambda file: file.suffix, reverse=True)
+index, data = sorted(Path(sys.argv[1]).rglob("frames.product-*.nb*"), key=lambda file: file.suffix, reverse=True)
 assert (index.suffix, data.suffix) == (".nbi", ".nbc")
 cases = 0
 for file in (index, data):
@@ -142,7 +142,7 @@ def test_compiled_code_that_is_damaged_on_the_disk_is_noticed_and_made_anew(tmp_
 COMPILED = """
 import numpy as np
 from kalmark.compiled import compiled
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import product
 
 A = np.arange(12.0).reshape(3, 4)
 for _ in range(2):

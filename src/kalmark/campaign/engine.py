@@ -25,8 +25,7 @@ from kalmark.filter.estimators import Ekf, Invariant
 from kalmark.filter.map import StochasticMap
 from kalmark.filter.maps import DENSE
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames import compose
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import compose, product
 from kalmark.geometry.spaces import Table
 from kalmark.models.landmark_views import LOOK, NOISE, look, noise_of
 from kalmark.models.landmarks import Point2D

@@ -20,7 +20,7 @@ from kalmark.arrays import Array, Index
 from kalmark.compiled import address_of, by_address, compiled, signature_of
 from kalmark.filter.kernels import RAISED, cholesky_inverse
 from kalmark.geometry.angles import exponential_v
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import product
 from kalmark.geometry.rotations import exp, left_jacobian, log, matrix, multiply
 from kalmark.geometry.spaces import ANGLE, LINEAR, OWN, ROTATION, SCALAR, TURNED, VECTOR, Table
 

@@ -24,7 +24,7 @@ from threadpoolctl import ThreadpoolController
 
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import product
 
 
 def _load_blas(module: str) -> str:

@@ -13,7 +13,7 @@ from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
 from kalmark.filter import kernels
 from kalmark.filter.corrections import call_generator
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import product
 from kalmark.geometry.pose_frames import body_axes
 from kalmark.geometry.spaces import HOMOGENEOUS, KIND, P_AT, Table
 from kalmark.models.observe import step

@@ -1,4 +1,4 @@
-"""Frames of the plane, F = (x, y, angle), with Jacobians.  [S] A.2 to A.5, (54)-(64), and App. C.1.
+"""Frames of the plane, F = (x, y, angle), with Jacobians and their product.  [S] A.2 to A.5, (54)-(64), and App. C.1.
 
 Value first, then Jacobians in argument order; a Jacobian ``OUT_in`` is d OUT / d in.  Points are (2,) or K at once,
 (K, 2); their Jacobians then are (K, 2, 3) and (K, 2, 2).
@@ -105,6 +105,18 @@ def inv_scan_many(y: Array) -> tuple[Array, Array]:
         P_y[i, 0, 0], P_y[i, 0, 1] = cos, -d * sin
         P_y[i, 1, 0], P_y[i, 1, 1] = sin, d * cos
     return p, P_y
+
+
+@compiled
+def product(A: Array, B: Array) -> Array:
+    """Return A B (m, n), for an A (m, k) that is so small that a call of BLAS would cost more than the sum."""
+    out = np.zeros((len(A), B.shape[1]))
+    for i in range(len(A)):
+        for k in range(len(B)):
+            a = A[i, k]
+            for j in range(B.shape[1]):
+                out[i, j] += a * B[k, j]
+    return out
 
 
 def one_or_many(function: Callable[..., tuple[Array, ...]], *given: Any) -> Any:

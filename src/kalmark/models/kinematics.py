@@ -13,8 +13,7 @@ from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, NotNegative, declared
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
-from kalmark.geometry.frames import compose
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import compose, product
 from kalmark.geometry.spaces import SE2
 from kalmark.models.observe import Compiled
 

@@ -14,7 +14,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.declare import Estimated, NotNegative, Positive, register
-from kalmark.geometry.matrices import product
+from kalmark.geometry.frames import product
 from kalmark.geometry.spaces import HEADING, SCALAR, VECTOR, Space
 from kalmark.models.kinematics import (
     NODES,

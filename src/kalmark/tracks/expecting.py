@@ -24,6 +24,15 @@ from kalmark.tracks.track import Tracks
 
 QUATERNION_AT = 6  # where the w of a pose is
 UNMEASURED = "its size has not been measured"
+Group = tuple[
+    ObservationModel,
+    list[int],
+    Array,
+    list[Array | None],
+    list[float | None],
+    Callable[..., "Linearised"],
+    Array | Index,
+]  # of one model: indices of names, l (K, n), extents, sizes, and what linearises them by their slots (K,) or by l
 
 
 class Looked(NamedTuple):
@@ -41,18 +50,6 @@ class Linearised(NamedTuple):
     Z: Array
     E_h: Array
     E_l: Array
-
-
-class _OneModel(NamedTuple):
-    """Landmarks of one model: the indices of their names, l (K, n), extents, sizes, and what `linearise` takes."""
-
-    model: ObservationModel
-    group: list[int]
-    l: Array
-    extents: list[Array | None]
-    sizes: list[float | None]
-    linearise: Callable[..., Linearised]
-    of: Array | Index  # l or the slots (K,)
 
 
 def expectations(
@@ -99,18 +96,18 @@ def expectations(
     )  # fmt: skip
 
 
-def _by_model(map_: Map, tracks: Tracks, channel: Channel, robot: str, names: Sequence[Id]) -> Iterator[_OneModel]:
+def _by_model(map_: Map, tracks: Tracks, channel: Channel, robot: str, names: Sequence[Id]) -> Iterator[Group]:
     """Yield the named landmarks by their models: those in the map, then those known exactly."""
     for model, group in tracks.by_model(channel, names, robot):
         slots = tracks.slots_of([names[i] for i in group])
         of = [tracks.confirmed.get(names[i]) for i in group]
         extents = [None if track is None else track.extent for track in of]
         sizes = [None if track is None else track.size_m for track in of]
-        yield _OneModel(model, group, map_.means(slots, model.d), extents, sizes, linearize_blocks, slots)
+        yield model, group, map_.means(slots, model.d), extents, sizes, linearize_blocks, slots
     for model, group in tracks.known_by_model(channel, names):
         known = [names[i] for i in group]
         l, extents = tracks.known.means(known, model.d), [tracks.known.extent(name) for name in known]
-        yield _OneModel(model, group, l, extents, [None] * len(known), linearised_known, l)
+        yield model, group, l, extents, [None] * len(known), linearised_known, l
 
 
 def _in_pose(E_h: Array, dof: int, times: int) -> Array:
