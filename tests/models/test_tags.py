@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import kalmark as km
 from differences import agree, derivative, frames, rotation_vectors
 from kalmark.geometry import frames3d, rotations
 from kalmark.models import cameras, tags
@@ -164,6 +165,21 @@ def test_a_small_tag_has_two_poses_and_the_better_one_is_kept(rng: np.random.Gen
     near = seen(lens, pose((0.02, 0.01, 0.4), 0.8), par) + 0.3 * rng.normal(size=8)
     assert tag_pose(lens, near, SIZE, par, 0.3)[3] < 0.2
     assert better > 60
+
+
+def test_a_tag_that_faces_the_camera_is_clear_only_where_its_covariance_includes_the_mirror_image(
+    rng: np.random.Generator,
+) -> None:
+    """Small tilts from afar: of what is taken for clear, the pose is one of its covariance."""
+    sensor = km.sensors.TagCorners(fx_px=500.0, fy_px=500.0, cx_px=376.0, cy_px=240.0, sigma_px=0.5)
+    for _ in range(200):
+        v = pose((*rng.uniform(-0.5, 0.5, 2), rng.uniform(2, 6)), rng.uniform(0, 0.08), *rng.uniform(-np.pi, np.pi, 2))
+        corners = tags.project_corners(sensor.code, v[None], np.array([2 * SIZE]), np.array(sensor.parameters))[0][0]
+        poses, V_y, chi2_ = sensor.both(np.append(corners + 0.5 * rng.normal(size=8), 2 * SIZE)[None])
+        apart, P = frames3d.minus(poses[0, 1], poses[0, 0]), 0.25 * V_y[0, 0] @ V_y[0, 0].T
+        assert np.isinf(chi2_[0, 1]) == (apart @ np.linalg.solve(P, apart) <= 1.0)
+    facing = tags.project_corners(sensor.code, pose((0, 0, 3), 0.0)[None], np.array([0.3]), np.array(sensor.parameters))
+    assert np.isinf(sensor.both(np.append(facing[0][0], 0.3)[None])[2][0, 1])
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.declare import NotNegative, Number, Positive, Within, declared, register
 from kalmark.errors import EventError
+from kalmark.geometry.frames3d import minus
 from kalmark.models import cameras, landmark_views, lines, tags
 from kalmark.models.landmark_views import Spatial, constant
 
@@ -355,12 +356,21 @@ class TagCorners(_Lens):
         return np.ascontiguousarray(v[:, 0]), V_y[:, 0]
 
     def both(self, y: Array) -> tuple[Array, Array, Array]:
-        """Return the two poses (K, 2, 7) that fit y, the better first, V_y (K, 2, 6, 8), chi-squares (K, 2)."""
+        """Return the two poses (K, 2, 7) that fit y, the better first, V_y (K, 2, 6, 8), chi-squares (K, 2).
+
+        The second chi-square is infinite where the covariance of the first pose includes the second: within one sigma,
+        as of a tag that faces the camera.
+        """
         corners, sizes = np.ascontiguousarray(y[:, :8]), np.ascontiguousarray(y[:, 8])
         par = np.array(self.parameters)
         rays = cameras.back_project(self.code, corners.reshape(-1, 2), par)[0].reshape(-1, 4, 3)
         v, V_y, cost = tags.tags_from_corners(self.code, corners, rays, sizes, par)
-        return v, V_y, cost / self.sigma_px**2
+        chi2 = cost / self.sigma_px**2
+        for k in np.flatnonzero(np.isfinite(cost).all(axis=1)):
+            apart, V = minus(v[k, 1], v[k, 0]), self.sigma_px * V_y[k, 0]
+            if apart @ np.linalg.solve(V @ V.T, apart) <= 1.0:
+                chi2[k, 1] = np.inf
+        return v, V_y, chi2
 
     def is_far(self, y: Array, z: Array) -> Flags:
         """Return which tags y (K, 9) have innovations z (K, 8) of half their size or more, or not finite."""

@@ -18,7 +18,6 @@ from kalmark.geometry.rotations import conjugate, from_matrix, left_jacobian_inv
 from kalmark.models.cameras import project
 
 ITERATIONS = 50
-FACING = 0.3  # rad: a tag that faces the camera so well is near its mirror image
 SAME = 1e-4  # distance (tag sizes) and angle (rad) below which two solutions are one
 
 
@@ -94,9 +93,8 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
     `rays` (K, 4, 3) are the corners' viewing rays.  From afar the corners are nearly the same when the tag is mirrored
     along the line of sight, so that the sum of squared pixels has two minima: both are sought, by Levenberg's method
     from the homography of the corners and from its mirror image, and the lower one comes first.  Where noise has left
-    but one, the second is its mirror image, without V_y; its sum is infinite where that is within `FACING`, for then it
-    does not matter.  All is NaN where the four pixels are no convex quadrangle of rays ahead.  V_y = (E'E)^-1 E' of
-    Gauss-Newton, so that V_y N V_y' is the covariance for noise N of the pixels.
+    but one, the second is its mirror image, without V_y.  All is NaN where the four pixels are no convex quadrangle of
+    rays ahead.  V_y = (E'E)^-1 E' of Gauss-Newton, so that V_y N V_y' is the covariance for noise N of the pixels.
     """
     k = len(y)
     v, V_y, cost = np.full((k, 2, 7), np.nan), np.full((k, 2, 6, 8), np.nan), np.full((k, 2), np.nan)
@@ -112,10 +110,9 @@ def tags_from_corners(lens: int, y: Array, rays: Array, size: Array, par: Array)
         apart = minus(a, b)
         same = np.abs(apart[:3]).max() < SAME * size[i] and np.abs(apart[3:]).max() < SAME
         if same or math.isnan(cost_b):
-            b, cost_b = mirror_pose(a), np.inf
-            if np.abs(minus(b, a)).max() > FACING:
-                e = project_corners(lens, b.reshape((1, 7)), np.array([size[i]]), par)[0]
-                cost_b = np.sum((y[i] - e[0]) ** 2)
+            b = mirror_pose(a)
+            e = project_corners(lens, b.reshape((1, 7)), np.array([size[i]]), par)[0]
+            cost_b = np.sum((y[i] - e[0]) ** 2)
             v[i, 1], cost[i, 1] = b, cost_b if math.isfinite(cost_b) else np.inf
         else:
             v[i, 1], V_y[i, 1], cost[i, 1] = b, np.linalg.solve(E_b.T @ E_b, E_b.T), cost_b
