@@ -12,7 +12,7 @@ import kalmark as km
 from kalmark.config import Config, build_slam, config_dict, load_config, open_config_log, slam_from_config
 from kalmark.config.opening import open_run
 from kalmark.config.sections import section_of
-from kalmark.declare import classes, parameters
+from kalmark.declare import built_in, classes, parameters
 from kalmark.errors import ConfigError
 from kalmark.logs import Log, Trajectory
 from kalmark.results.recording import config_yaml
@@ -50,8 +50,8 @@ def test_keys_and_defaults_are_those_of_the_models(role: str) -> None:
 
 def test_every_parameter_is_documented() -> None:
     for role in ("motion", "sensor", "landmark", "association", "estimator", "detector", "attention", "upkeep"):
-        for models in classes(role).values():
-            assert all(parameter.text.endswith(".") for model in models for parameter in parameters(model)), models
+        for model in built_in(role):
+            assert all(parameter.text.endswith(".") for parameter in parameters(model)), model
 
 
 def test_a_robot_without_a_start_starts_at_the_truth_exactly(tmp_path: Path) -> None:

@@ -290,7 +290,7 @@ def _parameter(name: str, default: Any, hint: Any) -> Parameter:
     return Parameter(
         name,
         kinds[0] if len(kinds) == 1 and not role else Any if kinds else None,
-        None if default in (dataclasses.MISSING, inspect.Parameter.empty) else default,
+        None if any(default is none for none in (dataclasses.MISSING, inspect.Parameter.empty)) else default,
         NoneType in parts,
         words,
         bounds,

@@ -372,7 +372,7 @@ TABLES: dict[str, tuple[Callable[[dict[str, Any], dict[str, Any]], object], str]
     "a negative count": (lambda d, _: d["tracks"]["confirmed"][0][1].update(hits=-1), r"2 has the counts .*-1"),
     "candidates of a sensor that is not there": (
         lambda d, _: d["tracks"]["candidates"].append([["a", "nose"], []]),
-        "that there are not",
+        "name sensors that no robot has",
     ),
     "no robots": (lambda _, s: s.update(robots=[]), "no attribute 'items', expected a map written by save"),
     "another model": (
