@@ -52,7 +52,7 @@ def _of_plugins() -> tuple[dict[str, Format], dict[str, PluginError]]:
 
 @documented
 def open_log(
-    path: Annotated[Path | str, "Folder or file; beside the configuration, in KALMARK_DATA or downloaded."],
+    path: Annotated[Path | str, "Folder or file: beside the configuration (`.` there), in KALMARK_DATA or downloaded."],
     format: Annotated[str | None, "Format of the log; recognised if absent."] = None,
     *,
     robots: Annotated[RobotNames, "Use only these robots, by name or number."] = None,

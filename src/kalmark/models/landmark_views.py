@@ -295,7 +295,7 @@ class Cone(Expecting):
     _: KW_ONLY
     range_min_m: Annotated[NotNegative, "Nearest landmark that is measured."] = 0.0
     range_max_m: Annotated[Limit, "Farthest landmark that is measured."] = math.inf
-    fov_rad: Annotated[Positive, "Field of view, a cone about the sensor's x axis."] = 2 * math.pi
+    fov_rad: Annotated[Positive, "Field of view: the full angle of a cone about the sensor's x axis."] = 2 * math.pi
 
     point_size: ClassVar[int] = 3  # numbers of a view that are the point
 

@@ -143,7 +143,7 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
             _try(state, scan, of, old)
     elif of.fitted:
         state.pose_hypotheses.pop(robot, None)
-        of.fitted = set()
+        of.fitted = {}
 
 
 def _note(state: State, scan: ScanContext, of: Evidence, look: existence.ObservedAndMissed | None) -> None:
@@ -235,7 +235,7 @@ def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     of_world = FRAMES[len(scan.channel.at)]
     to_robot = of_world.compose(of_world.inverse(scan.pose())[0], r[: len(found.T)])[0]
     write_robot(other.map, other.moving, of_world.compose(found.T, to_robot)[0], found.cov)
-    of.gain, of.fitted = found.gain, {old.names[row] for row in found.matched if row >= 0}
+    of.gain, of.fitted = found.gain, {old.names[row]: 0.0 for row in found.matched if row >= 0}
 
 
 def _pair(scan: ScanContext, places: Array | None, old: Known) -> dict[int, int]:
@@ -270,15 +270,14 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         logs = {name: gain for name, gain, yes in zip(names, gains.tolist(), counts, strict=True) if yes}
     if None in scan.ids:
         logs = existence.log_misses(view, old, state.policies[scan.key].upkeep) | logs
-    of.gain += sum(log for name, log in logs.items() if name not in of.fitted)
-    of.fitted |= logs.keys()
+    of.count(logs)
     if of.gain - of.ratio >= math.log(ODDS) and fits:
         again = _locate(state, scan, of, old) if None in scan.ids else None
         if None not in scan.ids or (again and is_same_pose(again.T, channel.pose(other.map, scan.robot))):
             _place(state, scan, of, other, [*fits])
     elif of.gain <= -SURE:
         del state.pose_hypotheses[robot]
-        of.fitted, of.gain = set(), 0.0
+        of.fitted, of.gain = {}, 0.0
 
 
 def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis, fits: Sequence[Id]) -> None:

@@ -13,7 +13,7 @@ Once it is known where the robot is instead, those begun since s that are older 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -32,7 +32,8 @@ class Evidence:
     """Landmarks `seen`, with when they were begun, when seen last, and the log, and those `missed` since.
 
     Of these it is when they were seen last, since when they are missed, and the log.  `ratio` is the least one, of an
-    onset at `since_ns`, `gain` that of the robot's second hypothesis, in which the landmarks `fitted` have counted.
+    onset at `since_ns`, `gain` that of the robot's second hypothesis, in which the landmarks `fitted` have counted with
+    these logs, those of the constellation together.
     `far` are the places (x, y, sigma), in space with z, of observations with ids elsewhere, as the filter has them, and
     so many scans of these were `held` back.
     """
@@ -44,7 +45,7 @@ class Evidence:
     held: int = 0
     far: dict[Id, tuple[float, ...]] = field(default_factory=dict)
     gain: float = 0.0
-    fitted: set[Id] = field(default_factory=set)
+    fitted: dict[Id, float] = field(default_factory=dict)
 
     def see(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, begun_ns: Callable[[Id], int]) -> None:
         """Take note of landmarks that were seen where they are expected."""
@@ -81,3 +82,11 @@ class Evidence:
         least = ratios[some].min()
         last = np.flatnonzero(some & (ratios <= least + EQUAL))[-1]
         self.ratio, self.since_ns = float(least), int(times[last + 1] - 1)
+
+    def count(self, logs: Mapping[Id, float]) -> None:
+        """Count landmarks for the second hypothesis, each once: one that was missed at first, when it is seen."""
+        for name, log in logs.items():
+            before = self.fitted.get(name)
+            if before is None or before < 0.0 < log:
+                self.gain += log - (before or 0.0)
+                self.fitted[name] = log
