@@ -74,8 +74,8 @@ def effect_of(run: Run, found: Searched) -> Effect:
     free = (filtered > 0) & (stated > 0)
     if not free.any():
         return Effect(shift_m=shift_m, robots=robots)
+    shift_m = max(shift_m, by_steady)  # of causes that are certain, which no noise explains
     status = status_by_shape(shift_m, extent, float(np.median(filtered[free])))
-    shift_m = max(shift_m, by_steady)  # of causes that are certain, which no noise explains: reported, but no alarm
     ratio, waited = filtered[free] / stated[free], np.isin(run.history.outcome, ("tentative", "deferred")).any()
     same_data = not waited and not filter_only_sensors(run.final_slam())  # what waited is not in the batch solution
     comparable = found.given.segments is None and same_data

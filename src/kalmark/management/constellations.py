@@ -182,8 +182,8 @@ def is_inside(corners: Complex, z: Complex) -> bool:
 def agreement_with_itself(of: Places, part: Index) -> tuple[Index, Index, int]:
     """Return how many landmarks of a part (K,) agree with others of it that are certainly different, and of how many.
 
-    Each edge between two that were seen together is moved on each other; there are that many such T, of which at most
-    about `MOVES` are in both (M,).
+    Each edge between two that were seen together is moved on each other, and T is that of all that agree then, as of a
+    repeat; there are that many such T, of which at most about `MOVES` are in both (M,).
     """
     z, corners, is_in = of.z, hull(of, part), np.zeros(len(of.z), np.bool_)
     is_in[part] = True
@@ -195,7 +195,10 @@ def agreement_with_itself(of: Places, part: Index) -> tuple[Index, Index, int]:
     chosen = alike[:: max(1, -(-len(alike) // MOVES))]
     agreeing, among = np.full(len(chosen), -2), np.full(len(chosen), -2)
     for m, (a, b, c, d) in enumerate(chosen):
-        turn, shift = fit(z[np.array([a, b])], z[np.array([c, d])])
+        pairs = np.array([(a, c), (b, d)])
+        alike_too = matched(of, fit(z[pairs[:, 0]], z[pairs[:, 1]]), pairs, is_in, is_in)
+        pairs = alike_too if len(alike_too) > 1 else pairs
+        turn, shift = fit(z[pairs[:, 0]], z[pairs[:, 1]])
         for l in part:
             moved = turn * z[l] + shift
             other = nearest(of, moved, of.tolerance)[0]
