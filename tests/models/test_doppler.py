@@ -13,7 +13,7 @@ from kalmark.errors import EventError, MapError, ModelError
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.models.model_check import check_model
 from kalmark.models.observe import PythonView, linearize, sensor_address, sensor_at, view_of
-from kalmark.models.protocols import tells_velocity
+from kalmark.models.protocols import has_velocity_state
 
 SENSORS: list[Any] = [km.sensors.RangeRate2D(), km.sensors.RangeRate3D(), km.sensors.Radar2D(), km.sensors.Radar3D()]
 COASTING: list[Any] = [km.motion.ConstantVelocity(), km.motion.ConstantTurnRate(), km.motion.ConstantVelocity3D()]
@@ -41,7 +41,7 @@ def test_jacobians_in_pose_state_and_landmark_are_those_of_differences(sensor: A
     at, angular = drawn(pose, rng), np.array(sensor.angular)
     view = view_of(sensor, landmark, at, motion, SINCE)
     in_python = PythonView(sensor, landmark, at, angular, motion, SINCE)
-    behind = motion.space if tells_velocity(motion) else pose
+    behind = motion.space if has_velocity_state(motion) else pose
     for _ in range(5):
         r, x = drawn(pose, rng), drawn(behind, rng)
         l, y = rng.normal(0, 5, (3, landmark.space.size)), np.zeros((3, len(sensor.columns)))

@@ -200,7 +200,7 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
             a[..., k] += s if finding.name == TURNED else -s
         return a
 
-    def corrected(e: Event) -> Event:
+    def replaced(e: Event) -> Event:
         if e.robot != robot:
             return e
         within = begin_s <= e.t_s < end_s
@@ -210,4 +210,4 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
             return replace(e, y=changed(e.y))
         return e
 
-    return replace(log, events=[corrected(e) for e in log.events])
+    return replace(log, events=[replaced(e) for e in log.events])

@@ -97,7 +97,7 @@ class _Estimator:
             done = self._one_by_one(model, m, scan, done, parallax)
         if before is not None:
             turn_own_errors(m, robot_here, before)
-        map_.corrected(robot, self.transports)
+        map_.finish_correction(robot, self.transports)
         return done
 
     def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan, parallax: bool) -> Correction:

@@ -124,7 +124,7 @@ class Map(Protocol):
     def opened(self, robot: int, mount: int, slots: Index, transports: bool) -> Marginal:
         """Return the dense map on which a scan of these blocks is fused, and their slots there."""
 
-    def corrected(self, robot: int, transports: bool) -> None:
+    def finish_correction(self, robot: int, transports: bool) -> None:
         """Complete the correction of what `opened` returned, by a scan of `robot`."""
 
     def state(self) -> State:
@@ -279,7 +279,7 @@ class StochasticMap(Layout):
         """Return this map, and the slots as they are."""
         return Marginal(self, robot, mount, slots)
 
-    def corrected(self, robot: int, transports: bool) -> None:
+    def finish_correction(self, robot: int, transports: bool) -> None:
         """Prepare a larger buffer in time."""
         self.prepare()
 

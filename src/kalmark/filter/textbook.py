@@ -276,7 +276,7 @@ class Textbook:
             e[k], z[k], Z[k] = book.e, book.z, book.Z
             d2[k] = z[k] @ np.linalg.solve(Z[k], z[k])
         _write(m, book, order)
-        map_.corrected(update.robot, False)
+        map_.finish_correction(update.robot, False)
         return Correction(e, z, Z, d2, fused, bool((d2 >= 0.0).all()))
 
     def initialize(self, map_: Map, robot: int, space: Space, l: Array, L_r: Array, Q: Array) -> int:
@@ -287,7 +287,7 @@ class Textbook:
         book.R, book.inv_observe = Q, lambda _r, _y: (l, L_r, np.eye(2))
         book.initialize(l)
         _write(m, book, order)
-        map_.corrected(robot, False)
+        map_.finish_correction(robot, False)
         return slot
 
     def _opened(

@@ -106,7 +106,7 @@ def _motion(model: Any, rng: Rng, found: _Findings) -> None:
         if isinstance(calibrating, protocols.NonlinearCalibration):
             of, a = calibrating, rng.normal(0, 1, (DRAWS, c)) * np.sqrt(np.diag(calibrating.calibration_cov))
             found.jacobian("U_a", lambda x: _arrays(map(of.calibrated, u, x, dt_s)), a, Rn(c), Rn(k), at | {"a": a})
-    if protocols.tells_velocity(model):
+    if protocols.has_velocity_state(model):
         size = 6 if space.world == "space" else 3
 
         def velocity(r: Array) -> list[Array]:

@@ -48,8 +48,8 @@ from kalmark.models.protocols import (
     SeesVelocity,
     Sensor,
     finds_depth,
+    has_velocity_state,
     parameter_covariance,
-    tells_velocity,
 )
 from kalmark.models.state_view import CHAIN, CHAINS, VELOCITY, call_chain, seen, sees_state, velocity_of
 
@@ -281,7 +281,7 @@ def links_of(sensor: Any, landmark: Any, motion: Any) -> tuple[Any, Any, bool]:
         return links_of_state, CHAINS[sensor.views, of_state], of_state
     if not isinstance(sensor, SeesVelocity):
         return links_of_landmarks, None, False
-    of_state = tells_velocity(motion)
+    of_state = has_velocity_state(motion)
     return links_of_moving, CHAINS[TWIST, of_state], of_state
 
 

@@ -299,7 +299,7 @@ class HoldsRate(Capability, Protocol):
         """Return what `HasVelocity` does, under a control u (k,); NaN where there is none yet: it does not turn."""
 
 
-def tells_velocity(motion: object) -> bool:
+def has_velocity_state(motion: object) -> bool:
     """Return whether the velocity of a robot is in its state; by default it is not."""
     return isinstance(motion, HasVelocity | HoldsRate)
 

@@ -40,8 +40,8 @@ from kalmark.models.protocols import (
     HasVelocity,
     HoldsRate,
     OfState,
+    has_velocity_state,
     sees_rates,
-    tells_velocity,
     velocity_in,
 )
 
@@ -207,5 +207,5 @@ def velocity_of(motion: Any, at: Array, r: Array, x: Array, since: Array) -> tup
     `since` is the control in force.
     """
     d = 2 if len(at) == 3 else 3
-    t, t_r, _, t_x = seen(TWIST, tells_velocity(motion), motion, r, at, x, since)
+    t, t_r, _, t_x = seen(TWIST, has_velocity_state(motion), motion, r, at, x, since)
     return t[:d], t_r[:d], t_x[:d]

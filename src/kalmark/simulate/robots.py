@@ -36,12 +36,12 @@ from kalmark.models.protocols import (
     SeesVelocity,
     TimedNoise,
     coasts,
+    has_velocity_state,
     measures_blocks,
     parameter_covariance,
     poses_kept,
     range_limit,
     self_calibrating,
-    tells_velocity,
     true_control,
     with_jacobians,
 )
@@ -405,7 +405,7 @@ def visible(
         of = np.zeros(len(v), dtype=np.int64)
         if moving:  # it sees what stands still
             k_before, before = carried.last or (0, robot.poses[0])
-            state = robot.states[k] if tells_velocity(robot.motion) else np.array(before)
+            state = robot.states[k] if has_velocity_state(robot.motion) else np.array(before)
             since = np.array([(k - k_before) * world.dt_s, *robot.done[k - 1]])
             t = velocity_of(robot.motion, carried.at, robot.poses[k], state, since)[0]
             v = np.column_stack([v, np.tile(t, (len(v), 1))])

@@ -43,7 +43,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
         model.model, moving.slot, channel.mount, slots, model.d, event.y, noise, min(gate, policy.limit),
         not channel.finds_depth,
     )  # fmt: skip
-    done, scan = state.corrected(update, event), None
+    done, scan = state.correct(update, event), None
     used = done.fused.tolist()
     if event.classes is not None or not all(used):
         scan = ScanContext(

@@ -74,8 +74,8 @@ def correct(
     """
     limit = limit_of(state, scan)
     if limit == math.inf:
-        return state.corrected(update, scan.event, estimator)
-    done = state.corrected(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
+        return state.correct(update, scan.event, estimator)
+    done = state.correct(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
     return done if done.fused.all() else hold_back_far(state, scan, names, update, done, estimator)
 
 
@@ -98,7 +98,7 @@ def hold_back_far(
         return done
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
     fused = done.fused.copy()
-    fused[out] = state.corrected(rest, scan.event, estimator).fused
+    fused[out] = state.correct(rest, scan.event, estimator).fused
     return done._replace(fused=fused)
 
 

@@ -33,8 +33,8 @@ from kalmark.models.protocols import (
     SelfCalibrating,
     StateDiffusion,
     coasts,
+    has_velocity_state,
     self_calibrating,
-    tells_velocity,
     true_control,
     velocity_in,
 )
@@ -279,7 +279,7 @@ class Moving:
     @cached_property
     def has_velocity(self) -> bool:
         """True if the velocity of the robot is in its state."""
-        return tells_velocity(self.motion)
+        return has_velocity_state(self.motion)
 
     def velocity(self, r: Array) -> tuple[Array, Array]:
         """Return the velocity b of a state r (size,) in the frame of the robot, (3 or 6,), and its Jacobian.

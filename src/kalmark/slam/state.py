@@ -358,7 +358,7 @@ class State:
         """Return whether a name is that of a block, or of a landmark known exactly."""
         return name in self.tracks.slots or name in self.tracks.known
 
-    def corrected(self, update: Update, event: Event, estimator: Estimator | None = None) -> Correction:
+    def correct(self, update: Update, event: Event, estimator: Estimator | None = None) -> Correction:
         """Correct the map.  Raises DivergedError if the robot is lost for good."""
         done = (estimator or self.estimator).correct(self.map, update)
         if self.may_grow and isinstance(self.map, StochasticMap):

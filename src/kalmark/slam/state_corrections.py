@@ -49,7 +49,7 @@ def correct_by_reading(state: State, event: Scan, reader: StateReader) -> Report
         fits = other is not None and not reader.counts and other.correct(estimator, update)
         if sum_ is not None and not reader.counts:
             sum_.correct(estimator, update)
-        done = state.corrected(update, event, estimator)
+        done = state.correct(update, event, estimator)
         done = done._replace(e=done.e[:, : event.width])
         report.fill([k], done)
         found += outcomes_of(JudgedScan([k], ids, [event.robot], done, reader.gate))

@@ -50,7 +50,7 @@ def correct_by_surveys(
     them.  `approach` corrects beforehand by those that are far from their expectation, within a gate, if there are any.
     """
     if least == math.inf:
-        return state.corrected(update, scan.event, estimator)
+        return state.correct(update, scan.event, estimator)
     done = elsewhere.correct(state, scan, names, update._replace(gate=min(update.gate, least)), estimator)
     trial, known = state.surveys.trial, state.tracks.known
     beyond = np.flatnonzero(~done.fused & ~np.isnan(done.d2)).tolist()
@@ -72,7 +72,7 @@ def correct_by_surveys(
         if lost:
             _widen(state, scan, before)
     rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
-    again, fused = state.corrected(rest, scan.event, estimator), done.fused.copy()
+    again, fused = state.correct(rest, scan.event, estimator), done.fused.copy()
     fused[out] = again.fused
     if lost:
         _widen(state, scan, before)

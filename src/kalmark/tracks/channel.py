@@ -132,7 +132,7 @@ class Channel:
     ) -> None:  # fmt: skip
         self.sensor: Any = sensor
         self.motion, self.sees_velocity = motion, isinstance(sensor, protocols.SeesVelocity)
-        self.counts = self.sees_velocity and not protocols.tells_velocity(motion)
+        self.counts = self.sees_velocity and not protocols.has_velocity_state(motion)
         held = len(motion.columns) if isinstance(motion, protocols.HoldsRate) else 0
         self.clone, self.since = -1, np.zeros(1 + held)
         self.at: Array = np.array(at)  # writable, like all else: numba compiles per kind of array

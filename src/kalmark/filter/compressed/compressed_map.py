@@ -360,7 +360,7 @@ class CompressedMap(Layout):
         self._before = self.active.x.copy()
         return Marginal(self.active, self.entered[robot], self.entered.get(mount, -1), at)
 
-    def corrected(self, robot: int, transports: bool) -> None:
+    def finish_correction(self, robot: int, transports: bool) -> None:
         """Complete the correction of what `opened` returned: correct inactive blocks if need be, go on with a job."""
         m = self.active
         if transports and len(self.A0):
