@@ -137,7 +137,7 @@ def counted(map_: Any) -> list[str]:
     """Return the list to which a map writes its full updates, corrections, starts, and the slots that enter."""
     done: list[Any] = []
     update, correct_all, enter = map_.full_update, map_.correct_all, map_._enter
-    correct, augment = map_.corrected, map_.augment
+    correct, augment = map_.finish_correction, map_.augment
 
     def updated() -> None:
         done.append("full update")
@@ -160,7 +160,7 @@ def counted(map_: Any) -> list[str]:
         return augment(*args)
 
     map_.full_update, map_.correct_all = updated, corrected_all
-    map_._enter, map_.corrected, map_.augment = entered, corrected, started
+    map_._enter, map_.finish_correction, map_.augment = entered, corrected, started
     return done
 
 
