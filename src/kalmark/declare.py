@@ -558,9 +558,9 @@ def class_of_file(name: str) -> type | None:
 
 def place_of_object(value: Any) -> tuple[Path, str] | None:
     """Return the user's file that has a class or another object, and the name it has there; None if none has it."""
-    modules = [sys.modules.get(getattr(value, "__module__", "")), *sys.modules.values()]  # first the one it is made in
-    homes = ((_file_of(module, ".py"), module) for module in modules)
-    named = ((file, home, name) for file, home in homes if file for name, own in vars(home).items() if own is value)
+    own = sys.modules.get(getattr(value, "__module__", ""))  # is looked at first
+    homes = ((_file_of(module, ".py"), module) for module in (own, *sys.modules.values()) if module)
+    named = ((file, home, name) for file, home in homes if file for name, one in vars(home).items() if one is value)
     return next(((file, name) for file, home, name in named if home.__name__.partition(".")[0] != "kalmark"), None)
 
 

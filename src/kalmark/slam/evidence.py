@@ -86,7 +86,7 @@ class Evidence:
     def count(self, logs: Mapping[Id, float]) -> None:
         """Count landmarks for the second hypothesis, each once: one that was missed at first, when it is seen."""
         for name, log in logs.items():
-            before = self.fitted.get(name)
-            if before is None or before < 0.0 < log:
-                self.gain += log - (before or 0.0)
+            before = self.fitted.get(name, 0.0)
+            if name not in self.fitted or before < 0.0 < log:
+                self.gain += log - before
                 self.fitted[name] = log

@@ -40,7 +40,7 @@ from kalmark.tracks.scan import Start
 from kalmark.tracks.survey_checks import Surveys
 from kalmark.tracks.track import ChannelKey, Tracks
 
-ANTENNAS = {2: Gps2D(), 3: Gps3D()}  # a fix is a reading of one
+ANTENNAS: dict[int, Any] = {2: Gps2D(), 3: Gps3D()}  # a fix is a reading of one
 CURE = "start again from a pose that is less certain, or with larger sigmas of controls and sensors"
 
 

@@ -88,8 +88,7 @@ def fix(state: State, event: Fix) -> Report:
     """Correct by a position from outside, the reading of an antenna; place a lost robot again where fixes agree."""
     antenna = state.antennas[event.robot]
     refuse_bad_fix(event, len(antenna.sensor.columns))
-    y, cov = event.y[None], event.cov[None]
-    reading = Scan(t_ns=event.t_ns, robot=event.robot, sensor="", y=y, ids=[event.robot], cov=cov)
+    reading = Scan(None, event.robot, "", event.y[None], [event.robot], event.cov[None], t_ns=event.t_ns)
     report = correct_by_reading(state, reading, antenna)
     report.event = event
     return report
