@@ -72,7 +72,7 @@ def not_described(slam: Slam, log: Log) -> Iterator[str]:
 def _own(slam: Slam) -> list[tuple[Any, Path | None, tuple[str, ...]]]:
     """Return the classes, or functions, of the models of a Slam, with the users' files that have them or the models.
 
-    The texts are parameters of which nobody can read what they are.
+    The texts are the parameters that a model does not store under their names.
     """
     mounts = mounts_of(slam.robots).values()
     parts = (slam.state.settings, *slam.robots.values(), *mounts)

@@ -161,9 +161,9 @@ class State:
         moving = self.moving[robot.name] = Moving(robot.motion, slot, bias_slot, held)
         if bias is not None and bias_slot is not None:
             moving.constants.append((bias_slot, *bias[1:]))
-        world = robot.motion.space
-        reader = StateReader(ANTENNAS[world.d], robot.motion, ORIGIN[world.pose.size], -1)
-        reader.gate = settings.association.threshold(world.d, reader.gate)
+        space = robot.motion.space
+        reader = StateReader(ANTENNAS[space.d], robot.motion, ORIGIN[space.pose.size], -1)
+        reader.gate = settings.association.threshold(space.d, reader.gate)
         self.antennas[robot.name] = reader
         for name, mount in robot.sensors.items():
             mount_slot, block = -1, mount.block(name)
