@@ -329,7 +329,7 @@ class _CompilationListener(event.Listener):  # type: ignore[misc, unused-ignore]
         self._count(event, -1)
 
     def _count(self, event: Any, by: int) -> bool:
-        own: bool = event.data["dispatcher"].py_func.__module__.startswith("kalmark.")
+        own = str(event.data["dispatcher"].py_func.__module__).startswith("kalmark.")  # None in code of `exec`
         self.depth += by * own
         arrayobj.raise_with_shape_context = refuse_sizes if self.depth else ERROR_WITH_SIZES
         return own

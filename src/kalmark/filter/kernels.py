@@ -52,7 +52,7 @@ _TRANS_NO = np.array([ord("T"), ord("N"), ord("T")], dtype=np.uint8)
 _MINUS_ONE_ONE = np.array([-1.0, 1.0])
 
 CACHED = 512  # rows of a covariance that stays in a cache between one pass over it and the next
-BAND, NARROW = 128, 16  # rows of a larger one that do, and rows of a smaller one that are corrected at once
+BAND, NARROW = 128, 24  # rows of a larger one that do, and rows of a smaller one that are corrected at once
 TILE = 64  # rows of a tile of which two do
 FEW = 8  # rows of a factor whose product takes less time without BLAS
 

@@ -25,7 +25,7 @@ AGAIN = "it repeats the one before to the last bit, though the robot has moved: 
 SELDOM = 0.01  # of new measurements may be taken for old ones
 MOVED = 0.99  # probability at which a robot has moved
 CHANCE = math.exp(-0.5 * (np.euler_gamma + math.log(2.0))) / math.sqrt(2.0 * math.pi)  # of Gaussian noise: g is known
-TOGETHER = 32  # measurements of the same ids whose differences are counted at once
+TOGETHER = 128  # measurements of the same ids whose differences are counted at once
 NOTHING = np.zeros(0)
 SAME = 1e-9  # differences are rounding below it, as a share of a number
 
