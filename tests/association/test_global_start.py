@@ -180,8 +180,9 @@ def test_the_tag_with_which_most_agree_determines_a_pose() -> None:
     assert isinstance(locate_tags(of, [9], np.array(seen[:1]), cov[:1]), str)
 
 
-@pytest.mark.parametrize("d", [2, 3])
-def test_directions_determine_a_pose_if_all_agree(d: int) -> None:
+@pytest.mark.parametrize(("d", "moved_m"), [(2, 0.0), (2, 2.0), (3, 0.0), (3, 0.5)])
+def test_directions_determine_a_pose_if_all_agree(d: int, moved_m: float) -> None:
+    """Some of them were seen from another place, so far away, as a robot that moves sees them one after the other."""
     rng = np.random.default_rng(d + 5)
     l, frames = rng.uniform(-9, 9, (14, d)), FRAMES[3 if d == 2 else 7]
     pose = T if d == 2 else np.array([1.0, -2.0, 0.5, 0.1, 0.5, -0.5, 0.7])
@@ -189,16 +190,18 @@ def test_directions_determine_a_pose_if_all_agree(d: int) -> None:
     of = Known(km.landmarks.Point2D() if d == 2 else km.landmarks.Point3D())
     for i, place in enumerate(l):
         of.add(i, place + (4.0 if i == 0 else 0.0))
-    v = frames.to_frame(pose, l)[0]
+    o = np.zeros(l.shape)
+    o[:7, 0] = moved_m
+    v = frames.to_frame(pose, l)[0] - o
     v = v / np.linalg.norm(v, axis=1, keepdims=True) + rng.normal(0.0, 0.002, v.shape)
     v /= np.linalg.norm(v, axis=1, keepdims=True)
-    assert isinstance(locate_rays(of, [*range(14)], v, np.full(14, 0.002)), str)
-    found = locate_rays(of, ["no", *range(1, 14)], v, np.full(14, 0.002))
+    assert isinstance(locate_rays(of, [*range(14)], v, np.full(14, 0.002), o), str)
+    found = locate_rays(of, ["no", *range(1, 14)], v, np.full(14, 0.002), o)
     assert isinstance(found, Proposal)
     assert found.matched.tolist() == [-1, *range(1, 14)]
     off = SE2.minus(found.T, pose) if d == 2 else SE3.minus(found.T, pose)
     assert off @ np.linalg.solve(found.cov, off) < 12.0
-    assert isinstance(locate_rays(of, [0, 1], v[:2], np.full(2, 0.002)), str)
+    assert isinstance(locate_rays(of, [0, 1], v[:2], np.full(2, 0.002), o[:2]), str)
 
 
 @pytest.mark.parametrize("flat", [False, True])

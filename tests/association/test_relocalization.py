@@ -67,7 +67,8 @@ def test_directions_to_three_landmarks_of_the_plane_give_the_pose(count: int) ->
     l, angle, place = V2[:count] * 3.0, -2.0, np.array([0.5, -0.25])
     v = (l - place) @ turn(angle)
     lengths = np.array([1.0, 0.2, 5.0, 3.0])[:count, None]  # only the directions count
-    np.testing.assert_allclose(resect(lengths * v, l), [[*place, angle]], atol=1e-9)
+    (T,) = resect(lengths * v, l, np.zeros((count, 2)))
+    np.testing.assert_allclose(T, [*place, angle], atol=1e-9)
 
 
 @pytest.mark.parametrize("flat", [False, True])
@@ -76,7 +77,7 @@ def test_of_the_poses_by_three_directions_of_space_one_is_right(count: int, flat
     q, place = from_euler(np.array([-0.4, 0.7, -1.0]))[0], np.array([4.0, -3.0, 2.0])
     l = V3[:count] * [1.0, 1.0, 0.0 if flat else 1.0]
     v = (l - place) @ matrix(q)
-    poses = resect(v / np.linalg.norm(v, axis=1, keepdims=True), l)
+    poses = resect(v / np.linalg.norm(v, axis=1, keepdims=True), l, np.zeros((count, 3)))
     T = min(poses, key=lambda T: float(np.linalg.norm(T[:3] - place)))
     assert len(poses) <= 4
     np.testing.assert_allclose(T[:3], place, atol=1e-6)
@@ -86,7 +87,7 @@ def test_of_the_poses_by_three_directions_of_space_one_is_right(count: int, flat
 def test_of_the_two_solutions_the_one_with_the_landmarks_in_front_is_taken() -> None:
     """All directions reversed fit the same linear equations: their pose is another one, turned by 180 deg."""
     l, place = V2 * 3.0, np.array([0.5, -0.25])
-    (T,) = resect(-(l - place) @ turn(0.3), l)
+    (T,) = resect(-(l - place) @ turn(0.3), l, np.zeros(l.shape))
     np.testing.assert_allclose(T[:2], place, atol=1e-9)
     assert abs(math.remainder(T[2] - 0.3 - math.pi, 2 * math.pi)) < 1e-9
 

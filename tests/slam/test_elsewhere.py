@@ -126,6 +126,31 @@ def test_what_a_carried_robot_began_before_it_saw_an_old_landmark_is_none(seed: 
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_carried_robot_is_found_by_bearings_of_one_landmark_at_a_time(seed: int) -> None:
+    """No scan determines its pose, and none of them moves the map: together they do, by how it moved between them."""
+    places, events, poses = carried_log(seed, ids=True)
+    motion = km.motion.Odometry2D(sigma_x_m=0.004, sigma_y_m=0.002, sigma_theta_rad=0.003)
+    camera = km.Mount(km.sensors.Bearing(sigma_bearing_rad=0.01, range_max_m=RANGE_M, fov_rad=4.6))
+    slam = km.Slam(km.Robot("rover", motion, start=path(1)[0], sensors={"laser": camera}))
+    for name, place in enumerate(places):
+        slam.add_landmark(name, place, 1e-4 * np.eye(2))
+    bearings = list[Event]()
+    for event in events:
+        if isinstance(event, km.Scan) and event.ids:
+            k = round(event.t_s * RATE_HZ)
+            some = slice(None) if k < 750 else slice(k % len(event.ids), k % len(event.ids) + 1)
+            bearings.append(km.Scan(event.t_s, "rover", "laser", event.y[some, 1:], ids=event.ids[some]))
+        else:
+            bearings.append(event)
+    off, carried = errors(slam, bearings, poses)
+    assert [gap.robot for gap in carried] == ["rover"]
+    assert carried[0].end_ns * 1e-9 < 750 / RATE_HZ + 5.0
+    assert off[-300:].max() < 0.8
+    table = slam.landmarks()
+    assert np.linalg.norm(np.array(table.means) - places[np.array(table.ids, dtype=np.int64)], axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_robot_is_found_by_a_sensor_whose_limits_are_not_stated(seed: int) -> None:
     """Its range is counted from its observations; landmarks beyond it contradict no pose."""
     _, events, poses = carried_log(seed, ids=False)

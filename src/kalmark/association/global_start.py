@@ -83,13 +83,15 @@ def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -
     return Proposal(found.T, cov, matched, -math.log(max(chance, math.exp(-2.0 * SURE))))
 
 
-def locate_rays(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:
+def locate_rays(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array, o: Array | None = None) -> Proposal | str:
     """Return the pose that unit vectors v (K, d) with these ids determine, or why they do not.
 
-    Each sigma (K,) is the root of the mean variance of d axes, of which one, that of the ray, has none.
+    Each sigma (K,) is the root of the mean variance of d axes, of which one, that of the ray, has none.  They are seen
+    from the places o (K, d) in the frame of the sensor, from its own if there are none.
     """
     d = v.shape[1]
-    return _by_ids(of, rows_of(of, ids), FEWEST_RAYS[d], _Rays(v, sigma * math.sqrt(d / (d - 1))))
+    seen = _Rays(v, sigma * math.sqrt(d / (d - 1)), np.zeros(v.shape) if o is None else o)
+    return _by_ids(of, rows_of(of, ids), FEWEST_RAYS[d], seen)
 
 
 def locate_ranges(of: Known, ids: Sequence[Id | None], T: Array, r: Array, sigma: Array) -> Proposal | str:
@@ -122,14 +124,15 @@ class _Points(NamedTuple):
 
 
 class _Rays(NamedTuple):
-    """Directions v (K, d) in the frame of a sensor, unit vectors, with their sigmas (K,), rad."""
+    """Directions v (K, d) in the frame of a sensor, unit vectors, with their sigmas (K,), rad, from places o (K, d)."""
 
     v: Array
     sigma: Array
+    o: Array
 
     def solve(self, l: Array, some: Index) -> Array:
         """Return the pose by some of the landmarks l (K, d), that from which most fit, if there is one."""
-        found = [self._refined(T, l, some) for T in resect(self.v[some], l[some])]
+        found = [self._refined(T, l, some) for T in resect(self.v[some], l[some], self.o[some])]
         found.sort(key=lambda T: float(np.sum(self.misfits(T, l, some))))
         fits = [T for T in found if (self.misfits(T, l, some) <= 1.0).all()]
         if not found or any(not is_same_pose(T, fits[0]) for T in fits):
@@ -149,6 +152,7 @@ class _Rays(NamedTuple):
     def _angles(self, T: Array, l: Array, some: Index) -> tuple[Array, Array, Flags]:
         """Return how far landmarks are beside their rays (K, d - 1), rad, its Jacobian, and which are ahead (K,)."""
         p, J = FRAMES[len(T)].to_frame(T, l[some])[:2]
+        p -= self.o[some]
         across = np.linalg.svd(self.v[some, None, :])[2][:, 1:]
         r = np.linalg.norm(p, axis=1) + 1e-300
         off = np.einsum("kad,kd->ka", across, p) / r[:, None]

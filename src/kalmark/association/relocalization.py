@@ -28,25 +28,34 @@ def align_points(v: Array, l: Array, weights: Array) -> Array:
     return np.concatenate([b - Q @ a, turn])
 
 
-def resect(v: Array, l: Array) -> list[Array]:
-    """Return the poses T, (3,) or (7,), from which landmarks l (K, d) are in the directions v (K, d); K is at least 3.
+def resect(v: Array, l: Array, o: Array) -> list[Array]:
+    """Return poses T, (3,) or (7,), from which landmarks l (K, d) are in the directions v (K, d); K is at least 3.
 
-    In the plane it is one, by the direct linear transformation: v x (Q l + t) = 0 is linear in Q and t, of which the
-    scale is free.  In space there are up to four, by three directions that are far apart.
+    Up to four: in the plane seen from the places o (K, 2) in the frame of T, in space by three directions that are far
+    apart, as if from its origin.
     """
-    return [_resect_in_plane(v, l)] if v.shape[1] == 2 else _resect_by_three(v, l)
+    return _resect_in_plane(v, l, o) if v.shape[1] == 2 else _resect_by_three(v, l)
 
 
-def _resect_in_plane(v: Array, l: Array) -> Array:
-    middle = l.mean(axis=0)
-    size = max(float(np.abs(l - middle).max()), 1e-300)
-    p, across = (l - middle) / size, np.stack([v[:, 1], -v[:, 0]], axis=1)  # Q = [[c, s], [-s, c]]
-    A = np.column_stack([np.sum(across * p, axis=1), across[:, 0] * p[:, 1] - across[:, 1] * p[:, 0], across])
-    c, s, *t = np.linalg.svd(A)[2][-1]
-    Q, t = np.array([[c, s], [-s, c]]), np.array(t)
-    ahead = np.sign(np.sum((p @ Q.T + t) * v))  # in front of the sensor
-    Q, t = ahead * Q / math.hypot(c, s), ahead * t / math.hypot(c, s)
-    return np.append(middle - Q.T @ t * size, math.atan2(Q[0, 1], Q[0, 0]))
+def _resect_in_plane(v: Array, l: Array, o: Array) -> list[Array]:
+    """Return the poses (3,) of the extreme sums of squares, if all landmarks are ahead there.
+
+    Across a ray, n'(Q l + u - o) = 0 is linear in u = -Q t and in c and s, Q = [[c, s], [-s, c]].  The least u leaves a
+    quadratic form of x = (c, s), x'G x + 2 g'x, which is extreme where a quartic in exp(i theta) is 0.
+    """
+    middle, n = l.mean(axis=0), np.stack([-v[:, 1], v[:, 0]], axis=1)
+    p, u_of = l - middle, np.linalg.inv(n.T @ n) @ n.T
+    A = np.column_stack([np.sum(n * p, axis=1), n[:, 0] * p[:, 1] - n[:, 1] * p[:, 0], -np.sum(n * o, axis=1)])
+    left = A - n @ (u_of @ A)
+    G, g = left[:, :2].T @ left[:, :2], left[:, :2].T @ left[:, 2]
+    even, odd = complex(G[0, 1], 0.5 * (G[0, 0] - G[1, 1])), complex(g[1], g[0])
+    poses = list[Array]()
+    for theta in np.angle(np.roots([even, odd, 0.0, odd.conjugate(), even.conjugate()])):
+        c, s = math.cos(theta), math.sin(theta)
+        Q, u = np.array([[c, s], [-s, c]]), -u_of @ (A @ [c, s, 1.0])
+        if (np.sum((p @ Q.T + u - o) * v, axis=1) > 0.0).all():
+            poses.append(np.append(middle - Q.T @ u, theta))
+    return poses
 
 
 def _resect_by_three(v: Array, l: Array) -> list[Array]:

@@ -22,7 +22,7 @@ from kalmark.results.run import Run
 from kalmark.results.warnings import TOO_SMALL, signs, window_warnings
 
 __all__ = ["Cause", "Effect", "Verdict", "diagnose"]
-AGAIN = "the log filtered again without the mistake"  # what a verdict was made of
+AGAIN = "log filtered again without the mistake"  # what a verdict was made of
 OF_OUTLIERS = MISFIT, OUTLIERS, MISPLACED, MOVED  # causes that observations which fit nothing explain
 MISFITTING = "from some time on the observations do not fit"
 

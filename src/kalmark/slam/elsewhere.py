@@ -48,7 +48,7 @@ from kalmark.tracks.track import Tracks
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
-HELD = 2  # scans of several landmarks that are held back without a second hypothesis
+HELD = 20  # scans of several landmarks that are held back without a second hypothesis
 MOST = 48  # landmarks of a constellation
 MEANWHILE = "mapped while its robot was elsewhere"
 
@@ -184,30 +184,31 @@ def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
     return old
 
 
-def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[Id | None], Array, Array]:
-    """Return the ids, places (K, 2 or 3) in the frame of the sensor and sigmas (K,) of what is seen, and was since."""
-    d, of_world = scan.dimensions, FRAMES[len(scan.channel.at)]
+def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[Id | None], Array, Array, Array]:
+    """Return the ids, places (K, 2 or 3) in the frame of the sensor and sigmas (K,) of what is seen, and was since.
+
+    And where it was seen from (K, 2 or 3) in that frame: of a direction the place is at a distance of 1 from there.
+    """
+    d, T, of_world, tracks = scan.dimensions, scan.pose(), FRAMES[len(scan.channel.at)], state.tracks
     v, sigma = scan.places()
-    T, ids, tracks = scan.pose(), list(scan.ids), state.tracks
     shown = {o.landmark for o in scan.report.observations}
-    for k, name in enumerate(ids):
-        if name is not None and math.isfinite(sigma[k]):
-            of.far[name] = *of_world.from_frame(T, v[k])[0].tolist(), float(sigma[k])
-    more: list[tuple[Id | None, tuple[float, ...]]] = [
-        (name, place) for name, place in of.far.items() if name not in ids
-    ]
+    rows = np.column_stack([of_world.from_frame(T, v)[0], np.tile(T[:d], (len(v), 1)), sigma]).tolist()
+    of.far |= {
+        name: tuple(row)
+        for name, row in zip(scan.ids, rows, strict=True)
+        if name is not None and math.isfinite(row[-1])
+    }
+    more: list[Any] = [(name, row) for name, row in of.far.items() if name not in scan.ids]
     more += [
-        (None, (*state.map.mean(tracks.slots[name])[:d].tolist(), float(np.median(sigma))))
+        (None, (*state.map.mean(tracks.slots[name])[:d], *T[:d], np.median(sigma)))
         for name in _young(tracks, scan.event.robot, of)
         if name not in shown and tracks.is_invented(name)
     ]
-    if more:
-        rows = np.array([place for _, place in more])
-        ids, v = [*ids, *(name for name, _ in more)], np.concatenate([v, of_world.to_frame(T, rows[:, :d])[0]])
-        sigma = np.append(sigma, rows[:, d])
+    ids, rows = [*scan.ids, *(name for name, _ in more)], np.array([*rows, *(row for _, row in more)])
+    v, o = (of_world.to_frame(T, part)[0] for part in (rows[:, :d], rows[:, d:-1]))
     r = np.linalg.norm(v, axis=1)
     nearest = [k for k in np.argsort(r, kind="stable").tolist() if math.isfinite(r[k])][:MOST]
-    return [ids[k] for k in nearest], v[nearest], sigma[nearest]
+    return [ids[k] for k in nearest], v[nearest], rows[nearest, -1], o[nearest]
 
 
 def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposal | None:
@@ -217,10 +218,10 @@ def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Propos
         found = locate_tags(old, scan.ids, v, V @ scan.R @ V.swapaxes(1, 2))
     elif scan.channel.gives_distances:
         found = locate_ranges(old, scan.ids, scan.pose(), *scan.distances())
-    elif scan.channel.gives_rays:
-        found = locate_rays(old, scan.ids, *scan.places())
     else:
-        found = locate_points(old, *_constellation(state, scan, of))
+        ids, v, sigma, o = _constellation(state, scan, of)
+        is_rays = scan.channel.gives_rays
+        found = locate_rays(old, ids, v - o, sigma, o) if is_rays else locate_points(old, ids, v, sigma)
     return None if isinstance(found, str) else found
 
 
@@ -334,7 +335,7 @@ def report_found(state: State, scan: ScanContext, since_ns: int, before: Array) 
 def _mapped_again(
     state: State, scan: ScanContext, before: Array, after: Array, cov: Array
 ) -> list[tuple[int, float]]:  # fmt: skip
-    """Return when landmarks were begun, and the log probabilities that they are at older ones by chance, if they are.
+    """Return when a robot's landmarks were begun, and the log odds that they are at older ones by chance, if they are.
 
     They are moved with their robot from where it was `before` to where it is `after`, with the covariance `cov`.
     """
@@ -352,7 +353,8 @@ def _mapped_again(
         v, V_r, V_l = (part[0] for part in frame.to_frame(before[:pose], place[None]))
         p, P_r, P_v = (part[0] for part in frame.from_frame(after[:pose], v[None]))
         nearest = tree.query(p)[1]
-        if not tracks.is_invented(name) or begun[nearest] >= t_ns:
+        is_own = tracks.is_invented(name) and tracks.confirmed[name].begun[1] == scan.event.robot
+        if not is_own or begun[nearest] >= t_ns:
             continue
         G = P_v @ np.hstack([V_r, V_l])
         P = state.map.covariance([scan.robot, tracks.slots[name]])

@@ -34,8 +34,8 @@ class Evidence:
     Of these it is when they were seen last, since when they are missed, and the log.  `ratio` is the least one, of an
     onset at `since_ns`, `gain` that of the robot's second hypothesis, in which the landmarks `fitted` have counted with
     these logs, those of the constellation together.
-    `far` are the places (x, y, sigma), in space with z, of observations with ids elsewhere, as the filter has them, and
-    so many scans of these were `held` back.
+    `far` are the places (x, y), in space with z, of observations with ids elsewhere and of their sensor, as the filter
+    has them, with a sigma, and so many scans of these were `held` back.
     """
 
     seen: dict[Id, tuple[int, int, float]] = field(default_factory=dict)
