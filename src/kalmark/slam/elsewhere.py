@@ -27,7 +27,7 @@ from kalmark.association.global_start import (
     locate_tags,
     rows_of,
 )
-from kalmark.association.relocalization import is_same_pose
+from kalmark.association.relocalization import SAME_M, is_same_pose
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry import frames3d
@@ -36,6 +36,8 @@ from kalmark.geometry.gaussian import gate
 from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import Space
 from kalmark.management import existence
+from kalmark.management.reparametrize import POINTS
+from kalmark.models.protocols import Pointed
 from kalmark.report import ELSEWHERE, Gap
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
@@ -44,7 +46,7 @@ from kalmark.tracks.channel import EUCLIDEAN
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.survey_checks import SURVEYED
-from kalmark.tracks.track import Tracks
+from kalmark.tracks.track import Track, Tracks
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
 SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
@@ -177,11 +179,19 @@ def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
     kind = channel.landmark.kind if channel.gives_places else EUCLIDEAN[scan.dimensions - 2]
     known, old = tracks.known.of_kind.get(kind), Known(channel.models[kind].landmark)
     for name in known.names if known is not None else ():
-        old.add(name, _block(state, name)[1])
+        old.add(name, tracks.known.mean(name))
     for name, track in tracks.confirmed.items():
-        if track.model.kind == kind and name not in young:
+        if name not in young and (track.model.kind == kind or _is_placed(state, track)):
             old.add(name, _block(state, name)[1])
     return old
+
+
+def _is_placed(state: State, track: Track) -> bool:
+    """Return whether the place of a landmark of unknown depth is known as well as a pose has to be."""
+    if not isinstance(track.model, Pointed):
+        return False
+    L = _block(state, track.id)[2]
+    return bool(np.linalg.norm(L @ state.map.covariance([track.slot]) @ L.T, 2) < SAME_M**2)
 
 
 def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[Id | None], Array, Array, Array]:
@@ -291,14 +301,14 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
     own = [slot, *(constant for constant, _, _ in other.moving.constants)]
     before, after, cov = state.map.mean(slot), other.map.mean(slot), other.map.covariance(own)
     d, dof = scan.dimensions, scan.channel.pose_dof
-    A, mapped = list[Array](), [name for name in fits if name not in tracks.known]
+    A, mapped, parts = list[Array](), [name for name in fits if name not in tracks.known], dict[Id, Array]()
     for name in fits:
-        space, l = _block(state, name)
+        space, l, parts[name] = _block(state, name)
         l[:d] -= after[:d]
         A.append(np.hstack([np.eye(space.dof, d), space.generator(l)]))
     ends = np.cumsum([0, *(len(part) for part in A)])
     G = np.split(np.linalg.pinv(np.concatenate(A)), ends[1:-1], axis=1)
-    of_map = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] for name in mapped)])
+    of_map = np.hstack([np.zeros((dof, 0)), *(G[fits.index(name)] @ parts[name] for name in mapped)])
     n = len(cov) + of_map.shape[1]
     F, Q = np.eye(n), np.zeros((n, n))
     F[: len(cov)], Q[: len(cov), : len(cov)] = 0.0, cov
@@ -368,9 +378,14 @@ def _mapped_again(
     return out
 
 
-def _block(state: State, name: Id) -> tuple[Space, Array]:
-    """Return the space and the numbers of a landmark, in the map or known exactly."""
+def _block(state: State, name: Id) -> tuple[Space, Array, Array]:
+    """Return the space and the numbers l of a landmark, of unknown depth as a point, and L (dof, .) in its block."""
     known, confirmed = state.tracks.known, state.tracks.confirmed
     if name in known:
-        return known.model(name).space, known.mean(name)
-    return confirmed[name].model.space, state.map.mean(confirmed[name].slot)
+        model, l = known.model(name), known.mean(name)
+    else:
+        model, l = confirmed[name].model, state.map.mean(confirmed[name].slot)
+    if isinstance(model, Pointed):
+        (p,), (L,) = model.to_point(l[None])
+        return POINTS[model.space.world].space, p, L
+    return model.space, l, np.eye(model.space.dof)
