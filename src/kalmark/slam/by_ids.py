@@ -50,8 +50,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
             state.map, tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report
         )  # fmt: skip
         if policy.limit < math.inf:
-            done = elsewhere.hold_back_far(state, scan, ids, update._replace(gate=gate), done)
-            used = done.fused.tolist()
+            elsewhere.weigh_far(state, scan, ids, update, done)
     report.e, report.z, report.Z = done[:3]
     judged = JudgedScan(range(len(ids)), ids, ids, done, gate)
     report.judged = (judged,)

@@ -46,11 +46,9 @@ from kalmark.tracks.channel import EUCLIDEAN
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.survey_checks import SURVEYED
-from kalmark.tracks.track import Track, Tracks
+from kalmark.tracks.track import Tracks
 
 ODDS = 1e9  # by which a robot is where it is placed, and not where its filter has it
-SEVERAL = 2  # landmarks with ids: one alone may be that which is elsewhere
-HELD = 20  # scans of several landmarks that are held back without a second hypothesis
 MOST = 48  # landmarks of a constellation
 MEANWHILE = "mapped while its robot was elsewhere"
 
@@ -69,39 +67,23 @@ def misfits(state: State, scan: ScanContext, done: Correction) -> Flags:
 def correct(
     state: State, scan: ScanContext, names: Sequence[Any], update: Update, estimator: Estimator | None = None
 ) -> Correction:
-    """Correct the map; observations with ids beyond `limit_of`, or of what cannot be seen from here, are far off.
-
-    These are left out while landmarks as old fit, and held back while none does.  After `HELD` scans of several that
-    lead to no pose they are used where their gate lets them.
-    """
+    """Correct the map; observations with ids beyond `limit_of`, or of what cannot be seen from here, are left out."""
     limit = limit_of(state, scan)
-    if limit == math.inf:
-        return state.correct(update, scan.event, estimator)
     done = state.correct(update._replace(gate=min(update.gate, limit)), scan.event, estimator)
-    return done if done.fused.all() else hold_back_far(state, scan, names, update, done, estimator)
+    if limit < math.inf and not done.fused.all():
+        weigh_far(state, scan, names, update, done)
+    return done
 
 
-def hold_back_far(
-    state: State, scan: ScanContext, names: Sequence[Any], update: Update, done: Correction,
-    estimator: Estimator | None = None,
-) -> Correction:  # fmt: skip
-    """Weigh the observations that a correction within `limit_of` left out; return what became of all, as `correct`."""
+def weigh_far(state: State, scan: ScanContext, names: Sequence[Any], update: Update, done: Correction) -> None:
+    """Weigh the observations that a correction within `limit_of` left out."""
     far = _far(scan, update, done, limit_of(state, scan))
     if not far:
-        return done
-    of = state.evidence_of(scan.event.robot)
-    fits = np.flatnonzero(done.fused).tolist()
+        return
+    of, fits = state.evidence_of(scan.event.robot), np.flatnonzero(done.fused).tolist()
     of.miss((names[k] for k in far), [-SURE] * len(far), scan.event.t_ns, state.begun_ns)
     of.see((names[k] for k in fits), [SURE] * len(fits), scan.event.t_ns, state.begun_ns)
     of.weigh()
-    out = [k for k in far if done.d2[k] <= update.gate]
-    of.held += len(of.missed) >= SEVERAL and not of.fitted
-    if of.ratio >= 0.0 or of.held <= HELD or not out:
-        return done
-    rest = update._replace(slots=update.slots[out], y=update.y[out], R=update.R[out])
-    fused = done.fused.copy()
-    fused[out] = state.correct(rest, scan.event, estimator).fused
-    return done._replace(fused=fused)
 
 
 def _far(scan: ScanContext, update: Update, done: Correction, limit: float) -> list[int]:
@@ -174,24 +156,18 @@ def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | N
 
 
 def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
-    """Return the landmarks that were in the map before, as they are now."""
+    """Return the landmarks that were in the map before, as they are now; a ray as a point, if its depth is known."""
     tracks, young, channel = state.tracks, _young(state.tracks, scan.event.robot, of), scan.channel
     kind = channel.landmark.kind if channel.gives_places else EUCLIDEAN[scan.dimensions - 2]
     known, old = tracks.known.of_kind.get(kind), Known(channel.models[kind].landmark)
     for name in known.names if known is not None else ():
         old.add(name, tracks.known.mean(name))
-    for name, track in tracks.confirmed.items():
-        if name not in young and (track.model.kind == kind or _is_placed(state, track)):
-            old.add(name, _block(state, name)[1])
+    for name in tracks.confirmed:
+        space, l, L = _block(state, name)
+        P = L @ state.map.covariance([tracks.slots[name]]) @ L.T if len(L) < L.shape[1] else np.zeros((1, 1))
+        if name not in young and space.kinds == old.model.space.kinds and np.linalg.norm(P, 2) < SAME_M**2:
+            old.add(name, l)
     return old
-
-
-def _is_placed(state: State, track: Track) -> bool:
-    """Return whether the place of a landmark of unknown depth is known as well as a pose has to be."""
-    if not isinstance(track.model, Pointed):
-        return False
-    L = _block(state, track.id)[2]
-    return bool(np.linalg.norm(L @ state.map.covariance([track.slot]) @ L.T, 2) < SAME_M**2)
 
 
 def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[Id | None], Array, Array, Array]:
@@ -354,7 +330,7 @@ def _mapped_again(
     tracks, d, pose = state.tracks, scan.dimensions, len(scan.channel.at)
     frame, dof, kind = FRAMES[pose], scan.channel.pose_dof, scan.channel.landmark.kind
     names = [name for name, track in tracks.confirmed.items() if track.model.kind == kind]
-    if kind not in EUCLIDEAN or len(names) < SEVERAL:
+    if kind not in EUCLIDEAN or len(names) < 2:
         return []
     places, begun = state.map.means(tracks.slots_of(names), d), np.array([*map(state.begun_ns, names)])
     tree = cKDTree(places)

@@ -35,14 +35,13 @@ class Evidence:
     onset at `since_ns`, `gain` that of the robot's second hypothesis, in which the landmarks `fitted` have counted with
     these logs, those of the constellation together.
     `far` are the places (x, y), in space with z, of observations with ids elsewhere and of their sensor, as the filter
-    has them, with a sigma, and so many scans of these were `held` back.
+    has them, with a sigma.
     """
 
     seen: dict[Id, tuple[int, int, float]] = field(default_factory=dict)
     missed: dict[Id, tuple[int, int, float]] = field(default_factory=dict)
     ratio: float = 0.0
     since_ns: int = 0
-    held: int = 0
     far: dict[Id, tuple[float, ...]] = field(default_factory=dict)
     gain: float = 0.0
     fitted: dict[Id, float] = field(default_factory=dict)
