@@ -71,7 +71,9 @@ def _value(finding: Finding) -> str:
 
 
 def _sure(finding: Finding) -> str:
-    return f"{figure(min(abs(finding.value) / finding.sigma, MOST_SIGMAS), 2)} sigma" if finding.sigma > 0 else ""
+    """Return of how many sigmas a finding is, behind its value; nothing if it was not found by them."""
+    sure = finding.sigma and f"{figure(min(abs(finding.value) / finding.sigma, MOST_SIGMAS), 2)}"
+    return f" ({sure} sigma)" if sure else ""
 
 
 def _sensor(finding: Finding) -> str:
@@ -134,7 +136,7 @@ def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _lengths(finding: Finding, unit: str) -> str:
     lengths, long = "ranges" if finding.of[2].startswith("range") else "distances", finding.value > 0
-    off = f"{_size(abs(finding.value), unit)} too {'long' if long else 'short'} ({_sure(finding)})"
+    off = f"{_size(abs(finding.value), unit)} too {'long' if long else 'short'}{_sure(finding)}"
     return f"{lengths} of {_sensor(finding)} are {off}"
 
 
@@ -144,13 +146,12 @@ def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     for sensor in () if "azimuth_rad" in finding.of else sensors:
         theta = _current(config, robot, "sensors", sensor, "mount", "theta_rad") or 0.0
         cures.append(_set(robot, f"sensors.{sensor}.mount.theta_rad", theta - finding.value))
-    return f"bearings of {_sensor(finding)} are off by {_value(finding)} ({_sure(finding)})", " ".join(cures)
+    return f"bearings of {_sensor(finding)} are off by {_value(finding)}{_sure(finding)}", " ".join(cures)
 
 
 def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
-    sure = f" ({_sure(finding)})" if finding.sigma > 0.0 else ""
-    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps{sure}"
+    evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps{_sure(finding)}"
     where = finding.of[:1] if finding.of[1] == ALL else finding.of[:2]
     return evidence, log_correction_line(config, "shift_s", where, finding.value)
 
@@ -159,7 +160,7 @@ def _mount_position(finding: Finding, config: Mapping[str, Any]) -> Words:
     robot, sensor, column = finding.of
     now = _current(config, robot, "sensors", sensor, "mount", column) or 0.0
     evidence = f"{column} of the mount of {_sensor(finding)} is {figure(now + finding.value)}, not {figure(now)}"
-    return f"{evidence} ({_sure(finding)})", _set(robot, f"sensors.{sensor}.mount.{column}", now + finding.value)
+    return f"{evidence}{_sure(finding)}", _set(robot, f"sensors.{sensor}.mount.{column}", now + finding.value)
 
 
 def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -168,7 +169,7 @@ def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
     each = " for each metre driven" if kind == "per_way" else ""
     size = _size(abs(finding.value), finding.unit.removesuffix("/m") if each else finding.unit)
     verb = "are" if ALSO in column or column == TURNING else "is"
-    evidence = f"{column} of {robot} {verb} {size} too {small}{each} ({_sure(finding)})"
+    evidence = f"{column} of {robot} {verb} {size} too {small}{each}{_sure(finding)}"
     return evidence, _calibrated(finding, config) or f"correct {column} by {_value(finding)}{each}"
 
 
@@ -209,7 +210,7 @@ def _sigma_of(column: str) -> str:
 
 
 def _offset(finding: Finding, config: Mapping[str, Any]) -> Words:
-    return f"{finding.name} of {'.'.join(finding.of)} is {_value(finding)} ({_sure(finding)})", ""
+    return f"{finding.name} of {'.'.join(finding.of)} is {_value(finding)}{_sure(finding)}", ""
 
 
 def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
@@ -224,7 +225,7 @@ def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _moving(finding: Finding, config: Mapping[str, Any]) -> Words:
     far = f", {figure(finding.moved_m)} m while it was seen" if finding.moved_m is not None else ""
-    evidence = f"landmark {finding.of[0]} moves at {_value(finding)} ({_sure(finding)}){far}: its place is wrong"
+    evidence = f"landmark {finding.of[0]} moves at {_value(finding)}{_sure(finding)}{far}: its place is wrong"
     return evidence, f"leave out {finding.of[0]}"
 
 
@@ -232,7 +233,7 @@ def _landmark_prior(finding: Finding, config: Mapping[str, Any]) -> Words:
     name = finding.of[0]
     at = ", ".join(figure(float(x)) for x in (np.zeros(0) if finding.at is None else finding.at))
     evidence = (
-        f"landmark {name} is {figure(finding.value)} m from its survey ({_sure(finding)}):"
+        f"landmark {name} is {figure(finding.value)} m from its survey{_sure(finding)}:"
         f" its observations place it at ({at}) m"
     )
     return evidence, f"correct {name} in the file of the survey, or leave it out"
@@ -280,7 +281,7 @@ def odd_control_text(robot: str, odd: OddControl, times: Sequence[str] = ()) -> 
 
 
 def _mount(finding: Finding, config: Mapping[str, Any]) -> Words:
-    return f"the sensor {_sensor(finding)} is turned by {_value(finding)} ({_sure(finding)})", ""
+    return f"the sensor {_sensor(finding)} is turned by {_value(finding)}{_sure(finding)}", ""
 
 
 _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
