@@ -11,7 +11,6 @@ import pytest
 from hall import hall, mapped
 
 import kalmark as km
-from kalmark.cli.run import VERDICT_OBSERVATIONS
 from kalmark.diagnosis import doubled_landmarks
 from kalmark.events import Control, Scan
 from kalmark.results.history import History
@@ -124,7 +123,7 @@ def test_scans_that_are_late_are_named_before_the_map_that_they_double_by_the_ve
         Scan(t_ns=e.t_ns + 200_000_000, robot="rover", sensor="laser", y=e.y) if isinstance(e, Scan) else e
         for e in log.events[: len(log.events) // 2]
     ]
-    verdict = km.diagnose(mapped(replace(log, events=sorted(late, key=km.events.sort_key))), VERDICT_OBSERVATIONS)
+    verdict = km.diagnose(mapped(replace(log, events=sorted(late, key=km.events.sort_key))), 3_000)
     names = [cause.name for cause in verdict.causes]
     assert (verdict.map, names[0]) == ("wrong", "time_offset")
     assert "map_repeats" not in names  # the delay explains it

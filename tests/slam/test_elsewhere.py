@@ -269,6 +269,29 @@ def test_a_robot_of_space_that_coasts_is_placed_once_with_another_velocity() -> 
     assert error @ np.linalg.solve(slam.covariance("diver"), error) < 32.9, ".999 of chi-square of 12"
 
 
+DIRECTIONS = "robots.robot.sensors.sonar={type: bearing, sigma_azimuth_rad: 0.01, sigma_elevation_rad: 0.01}"
+POSES = "robots.rig.sensors.camera={type: tag_pose, sigma_position_m: 0.02, sigma_rotation_rad: 0.02}"
+
+
+@pytest.mark.parametrize(("name", "keys"), [("tags_room", []), ("tags_room", [POSES]), ("diver", [DIRECTIONS])])
+def test_a_robot_of_space_is_found_in_its_own_map(name: str, keys: list[str]) -> None:
+    """By tags, and by directions, of whose landmarks it knows the places, though none is a Euclidean point yet."""
+    world = load_world(name, [*keys, "filter.map={known: null}"])
+    log = simulate(world, seed=1)
+    slam, times = build_slam(world.config(), log), sorted({event.t_ns for event in log.events})
+    first, last = times[len(times) * 6 // 10], times[len(times) * 7 // 10]
+    gaps, found = list[Any](), dict[int, Any]()
+    for event in log.events:
+        if not first < event.t_ns <= last:
+            moved = event if event.t_ns <= first else replace(event, t_ns=event.t_ns - last + first)
+            gaps += [gap.kind for gap in slam.process(moved).gaps]
+            found[event.t_ns] = slam.mean(event.robot)[:3]
+    truth = next(iter(log.truth.values())).at(np.array([*found]))[:, :3]
+    off = np.linalg.norm(np.array([*found.values()]) - truth, axis=1)
+    assert gaps == ["elsewhere"]
+    assert off[-20:].max() < 0.3
+
+
 @pytest.mark.parametrize("height_m", [4.0, 0.0])
 def test_a_robot_of_space_is_found_by_ranges_to_beacons_at_a_ceiling_too(height_m: float) -> None:
     rng, truth = np.random.default_rng(1), np.array([2.0, 1.0, 0.5, 0, 0, 0, 1.0])

@@ -37,7 +37,7 @@ from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import Space
 from kalmark.management import existence
 from kalmark.management.reparametrize import POINTS
-from kalmark.models.protocols import Pointed
+from kalmark.models.protocols import Pointed, UnknownDepth
 from kalmark.report import ELSEWHERE, Gap
 from kalmark.slam.evidence import Evidence
 from kalmark.slam.pose_hypothesis import PoseHypothesis, write_robot
@@ -361,7 +361,7 @@ def _block(state: State, name: Id) -> tuple[Space, Array, Array]:
         model, l = known.model(name), known.mean(name)
     else:
         model, l = confirmed[name].model, state.map.mean(confirmed[name].slot)
-    if isinstance(model, Pointed):
+    if isinstance(model, UnknownDepth) and isinstance(model, Pointed):
         (p,), (L,) = model.to_point(l[None])
         return POINTS[model.space.world].space, p, L
     return model.space, l, np.eye(model.space.dof)
