@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from kalmark.results.run import Run
 
 SHOWN = 5
+VERDICT_OBSERVATIONS = 5_000  # that the verdict at the end of a run takes
 
 
 class OnError(StrEnum):
@@ -139,7 +140,7 @@ def judge(result: Run) -> None:
     except PluginError as error:
         say(f"warning: no verdict: {error}", err=True)
     else:
-        diagnose(result, brief=True, progress=True)
+        diagnose(result, VERDICT_OBSERVATIONS, brief=True, progress=True)
 
 
 def finish(result: Run, out: Path, title: str) -> None:
