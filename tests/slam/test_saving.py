@@ -401,7 +401,7 @@ def test_a_map_of_another_version_is_refused(version: int | None, saved: Path, t
         description = json.loads(archive.read("slam.json"))
     changed = json.dumps(description | {"kalmark": version}).encode()
     reseal(tmp_path / "map.kmk", {"slam.json": changed}, saved)
-    with pytest.raises(MapError, match=f"version is {version}, expected 23"):
+    with pytest.raises(MapError, match=f"version is {version}, expected 24"):
         km.Slam.load(tmp_path / "map.kmk")
 
 

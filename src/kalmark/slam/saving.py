@@ -39,7 +39,7 @@ from kalmark.slam.state import State
 from kalmark.tracks.channel import Channel
 from kalmark.tracks.track import ChannelKey, Status
 
-VERSION = 23
+VERSION = 24
 DESCRIPTION, NUMBERS, SUMS = "slam.json", "numbers", "sha256"
 LARGE = 1 << 20  # bytes of an array that is stored as it is: the digits of a large covariance do not compress
 
