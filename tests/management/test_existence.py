@@ -33,7 +33,7 @@ def counted(seen: int, absent: float, missed: float) -> Any:
 
 def test_of_the_landmarks_of_somebody_who_walks_nine_in_ten_are_marked_and_of_the_trees_none() -> None:
     ghosts, trees = list[bool](), list[bool]()
-    for seed in range(2):
+    for seed in range(3):
         field = Field(walks=True)
         log, of = field.log(STEPS, seed)
         slam = field.slam()
@@ -106,7 +106,7 @@ def test_the_detection_probability_is_found_beside_what_never_was_there() -> Non
 
 def test_a_miss_where_little_is_seen_counts_little() -> None:
     looks, hidden = Looks(), np.array([False])
-    near, far = (cells_of(np.array([r]), np.zeros(1), hidden) for r in (3.0, 12.0))
+    near, far = (cells_of(np.array([r]), np.zeros(1), hidden, ~hidden) for r in (3.0, 12.0))
     for k in range(100):
         looks.count(near, np.array([k % 10 > 0]))
         looks.count(far, np.array([k % 10 == 0]))

@@ -50,18 +50,18 @@ def test_a_sensor_that_stands_looks_again_after_twenty_scans() -> None:
 
 
 def test_cells_are_four_to_an_octave_of_ranges_and_15_deg_of_bearings() -> None:
-    r = np.array([1.0, 2.0**0.26, 2.0, 1e-9, 1e30])
-    np.testing.assert_array_equal(cells_of(r, np.zeros(5), np.zeros(5, bool))[:, 0], [32, 33, 36, 0, RANGES - 1])
+    r, no, yes = np.array([1.0, 2.0**0.26, 2.0, 1e-9, 1e30]), np.zeros(5, bool), np.ones(5, bool)
+    np.testing.assert_array_equal(cells_of(r, np.zeros(5), no, yes)[:, 0], [32, 33, 36, 0, RANGES - 1])
     bearing = np.radians([-180.0, -164.0, 0.0, 16.0, 180.0])
-    np.testing.assert_array_equal(cells_of(np.ones(5), bearing, np.zeros(5, bool))[:, 1], [0, 1, 12, 13, 0])
-    hidden = cells_of(np.ones(2), np.zeros(2), np.array([False, True]))[:, 2]
-    np.testing.assert_array_equal(hidden, [0, 1])
+    np.testing.assert_array_equal(cells_of(np.ones(5), bearing, no, yes)[:, 1], [0, 1, 12, 13, 0])
+    hidden, in_reach = np.array([False, True] * 2), np.array([True, True, False, False])
+    np.testing.assert_array_equal(cells_of(np.ones(4), np.zeros(4), hidden, in_reach)[:, 2], [0, 1, 2, 3])
 
 
 def looked_at(shares: list[tuple[float, float, bool, float]], number: int) -> tuple[Looks, np.ndarray]:
     """Return looks at so many landmarks of each range, bearing, hidden or not, and share seen, and their cells."""
     r, bearing, hidden, share = (np.array(column) for column in zip(*shares, strict=True))
-    cells, looks = cells_of(r, bearing, hidden.astype(bool)), Looks(taken=AGAIN)
+    cells, looks = cells_of(r, bearing, hidden.astype(bool), np.ones(len(r), bool)), Looks(taken=AGAIN)
     for k in range(number):
         looks.count(cells, k < number * share)
     return looks, cells
@@ -97,7 +97,7 @@ def test_what_is_seen_always_is_taken_to_be_seen_by_98_percent() -> None:
 
 
 def test_without_anything_seen_a_miss_counts_in_full() -> None:
-    cells, looks = cells_of(np.array([3.0]), np.zeros(1), np.zeros(1, bool)), Looks(taken=AGAIN)
+    cells, looks = cells_of(np.array([3.0]), np.zeros(1), np.zeros(1, bool), np.ones(1, bool)), Looks(taken=AGAIN)
     looks.count(cells, np.array([False]))
     np.testing.assert_array_equal(looks.weights(cells), [1.0])
 

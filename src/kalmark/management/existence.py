@@ -1,6 +1,8 @@
 """Existence of landmarks: their log odds, by the looks of a sensor in which each was expected, and seen or not.
 
-A look (`tracks/looks.py`) counts for the landmarks about the sensor that are surely within its field of view and range.
+A look (`tracks/looks.py`) counts for the landmarks about the sensor that are surely within its field of view and range,
+and that were seen from that direction, as far away.  Of a corner, or of what is behind a wall, other looks count less:
+together those from one side count no more than that something hides it there, which is as likely as in the log.
 Of each are kept how often it was `seen`, the misses until it was last seen, `absent`, and those since, `missed`.  The
 detection probabilities of the landmarks of a map are spread by a Beta density (a, b), the likeliest one for these
 counts beside a share of landmarks that never were there.  A thing that stands is compared with two that do not; these
@@ -32,7 +34,7 @@ from kalmark.events import Id
 from kalmark.management.upkeep import Upkeep
 from kalmark.tracks.channel import Channel, ObservationModel
 from kalmark.tracks.known_landmarks import Known
-from kalmark.tracks.looks import Looks, cells_of
+from kalmark.tracks.looks import SIDE, Looks, cells_of, sectors_of
 from kalmark.tracks.scan import ScanContext
 from kalmark.tracks.track import Track, Tracks
 
@@ -98,10 +100,16 @@ def look(scan: ScanContext, upkeep: Upkeep) -> ObservedAndMissed | None:
         ranges.append(np.sqrt((v[:, : scan.dimensions] ** 2).sum(axis=1)))
         sure = _surely(scan.channel, v)
         names, v, r = [near[i] for i in np.flatnonzero(sure).tolist()], v[sure], ranges[-1][sure]
-        bearing = np.arctan2(v[:, 1], v[:, 0])
+        bearing, sectors = np.arctan2(v[:, 1], v[:, 0]), sectors_of(pose, v[:, : scan.dimensions])
         there, hidden = np.array([name in seen for name in names], dtype=np.bool_), _hidden(scan, r, bearing)
-        clear = there | ~_unclear(scan, model, names, v, ~there, left)
-        weights, cells = _weights(looks, upkeep, r, bearing, hidden)
+        in_reach, most = _reach(tracks, names, r, sectors, looks)
+        clear = there | (~_unclear(scan, model, names, v, ~there, left) & (most > 0.0))
+        weights, cells = _weights(looks, upkeep, r, bearing, hidden, in_reach)
+        weights = np.minimum(weights, most)
+        for i in np.flatnonzero(clear).tolist():
+            if (track := tracks.confirmed.get(names[i])) is not None:
+                track.reach[sectors[i]] = max(track.reach[sectors[i]], r[i] if there[i] else 0.0)
+                track.beyond[sectors[i] // SIDE] += 0.0 if there[i] or in_reach[i] else weights[i]
         far = float(r[there].mean()) if there.any() else far
         if usual:
             looks.count(cells[clear], there[clear])
@@ -236,14 +244,34 @@ def log_misses(scan: ScanContext, of: Known, upkeep: Upkeep) -> dict[Id, float]:
     rows = of.nearest(pose[None, : scan.dimensions], AROUND)
     v = of.model.seen_from(pose, of.values[rows])[0]
     sure = _surely(scan.channel, v)
-    r, bearing = np.sqrt((v[sure, : scan.dimensions] ** 2).sum(axis=1)), np.arctan2(v[sure, 1], v[sure, 0])
-    logs = looks.log_miss * _weights(looks, upkeep, r, bearing, _hidden(scan, r, bearing))[0]
-    return dict(zip([of.names[row] for row in rows[sure].tolist()], logs.tolist(), strict=True))
+    v, names = v[sure, : scan.dimensions], [of.names[row] for row in rows[sure].tolist()]
+    r, bearing = np.sqrt((v**2).sum(axis=1)), np.arctan2(v[:, 1], v[:, 0])
+    in_reach, most = _reach(scan.tracks, names, r, sectors_of(pose, v), looks)
+    weights = _weights(looks, upkeep, r, bearing, _hidden(scan, r, bearing), in_reach)[0]
+    return dict(zip(names, (looks.log_miss * np.minimum(weights, most)).tolist(), strict=True))
 
 
-def _weights(looks: Looks, upkeep: Upkeep, r: Array, bearing: Array, hidden: Flags) -> tuple[Array, Index]:
+def _reach(
+    tracks: Tracks, names: Sequence[Id], r: Array, sectors: Index, looks: Looks
+) -> tuple[Flags, Array]:  # fmt: skip
+    """Return which landmarks at ranges r (K,) were seen from as far away in these directions (K,): nothing hides them.
+
+    And how much a miss counts at most (K,): what hides one from there hides it in later looks, too.  One that was
+    given, or is known exactly, is in reach.
+    """
+    in_reach, most = np.ones(len(names), dtype=np.bool_), np.full(len(names), math.inf)
+    for i, name in enumerate(names):
+        track = tracks.confirmed.get(name)
+        if track is not None and track.begun[1] and r[i] > track.reach[sectors[i]]:
+            in_reach[i], most[i] = False, looks.most - track.beyond[sectors[i] // SIDE]
+    return in_reach, np.maximum(most, 0.0)
+
+
+def _weights(
+    looks: Looks, upkeep: Upkeep, r: Array, bearing: Array, hidden: Flags, in_reach: Flags
+) -> tuple[Array, Index]:
     """Return what misses at ranges r and bearings (K,) count (K,), 1 where most is seen, and their cells (K, 3)."""
-    cells = cells_of(r, bearing, hidden)
+    cells = cells_of(r, bearing, hidden, in_reach)
     return np.where(hidden, 0.0, 1.0) if upkeep.p_detect is not None else looks.weights(cells), cells
 
 

@@ -298,6 +298,8 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
     for track in [*tracks.tentative.values()]:
         state.map.remove(track.slot)
         del tracks.tentative[track.id]
+    for track in tracks.confirmed.values():  # they were looked for from another place
+        track.missed, track.beyond[:] = 0.0, 0.0
     state.clones.forget_current(robot)
     state.moving[robot].left_out.clear()
     report_found(state, scan, of.since_ns, before)

@@ -15,11 +15,18 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.errors import MapError
+from kalmark.geometry.pose_frames import FRAMES
 
 MOVED, TURNED_RAD, STANDING = 0.1, 0.2, 20  # of the range; a turn; scans of a sensor that stands: another look
 PER_OCTAVE, NEAREST_LOG2, RANGES, BEARINGS = 4, 8, 80, 24  # of ranges, from 2^-8 m on; sectors of bearings
 AGAIN = 8  # looks until what a miss counts is estimated again, but for the first ones
-CELLS = RANGES, BEARINGS, 2  # the last ones: nothing stands nearer, something does
+CELLS = (
+    RANGES,
+    BEARINGS,
+    4,
+)  # the last ones: nothing stands nearer, something does; the same from where it was not seen yet
+HIDDEN = 0.1, 5.0  # of landmarks are hidden from another direction; looks that this is worth
+SECTORS, SIDE = 24, 3  # of directions from a landmark to a sensor, and of one of its eight sides
 ROUNDS = 4  # in which the factors of the detection probability are fitted
 MOST = 0.98  # of a detection probability
 
@@ -30,9 +37,9 @@ class Looks:
 
     `pose` (3,) or (7,) is that of the sensor at the last look, `scale_m` how far it saw, `since` the scans since then
     and `changes` the landmarks that had come or gone; so many looks were `taken`.  `counts` (2, *CELLS) are the
-    landmarks seen and expected, by range, by bearing, and by whether something stands nearer, `table` (*CELLS,) what a
+    landmarks seen and expected, by range, by bearing, and by what may hide them, `table` (*CELLS,) what a
     miss counts there, and `log_miss` the log probability that a landmark is missed which stands where those are that
-    are seen.
+    are seen.  From a side from where a landmark was not seen yet all misses together count at most `most`.
     """
 
     pose: Array | None = None
@@ -43,6 +50,7 @@ class Looks:
     counts: Array = field(default_factory=lambda: np.zeros((2, *CELLS)))
     table: Array = field(default_factory=lambda: np.ones(CELLS))
     log_miss: float = math.log(0.5)
+    most: float = 1.0
 
     def is_due(self, pose: Array, changes: int) -> bool:
         """Return whether a scan from this pose is another look; a landmark that came or went makes it one."""
@@ -70,10 +78,11 @@ class Looks:
             p = self.detection()
             self.log_miss = math.log1p(-min(float((self.counts[0] * p).sum() / self.counts[0].sum()), MOST))
             self.table = np.log1p(-np.minimum(p, -math.expm1(self.log_miss))) / self.log_miss
+            self.most = math.log(self._hidden()) / self.log_miss
         return np.asarray(self.table[tuple(cells.T)])
 
     def detection(self) -> Array:
-        """Return the detection probability (*CELLS,): a factor by the range, one by the bearing, one by what is nearer.
+        """Return the detection probability (*CELLS,): a factor by the range, one by the bearing, one by what may hide.
 
         Each is what is seen there over what the others expect.  Where nothing is known it is a half by the range, and
         the others change nothing.
@@ -85,6 +94,15 @@ class Looks:
             b = (seen.sum((0, 2)) + 0.5) / (r @ (expected @ h) + 0.5)
             h = (seen.sum((0, 1)) + 0.5) / (b @ np.tensordot(r, expected, 1) + 0.5)
         return np.minimum(r[:, None, None] * b[:, None] * h, MOST)
+
+    def _hidden(self) -> float:
+        """Return the probability that something hides a landmark from a direction from which it was not seen yet.
+
+        It is `HIDDEN` before anything is known of that, as from so many looks.
+        """
+        seen, expected = self.counts.sum((1, 2))
+        hidden = max(expected[2] - seen[2] * (expected[0] + 0.5) / (seen[0] + 0.5), 0.0)
+        return float((hidden + HIDDEN[0] * HIDDEN[1]) / (expected[2] + HIDDEN[1]))
 
     def count(self, cells: Index, seen: Flags) -> None:
         """Count what was seen (K,) of what was expected in these cells (K, 3)."""
@@ -100,11 +118,17 @@ class Looks:
             )
 
 
-def cells_of(r: Array, bearing: Array, hidden: Flags) -> Index:
-    """Return the cells (K, 3) of landmarks at ranges r and bearings (K,), with something that stands nearer or not."""
+def sectors_of(pose: Array, v: Array) -> Index:
+    """Return the sectors (K,) of the directions, about the vertical, from things v (K, 2 or 3) to their sensor."""
+    back = pose[: v.shape[1]] - FRAMES[len(pose)].from_frame(pose, v)[0]
+    return np.asarray((np.arctan2(back[:, 1], back[:, 0]) / (2 * math.pi) + 0.5) * SECTORS % SECTORS, dtype=np.int64)
+
+
+def cells_of(r: Array, bearing: Array, hidden: Flags, in_reach: Flags) -> Index:
+    """Return the cells (K, 3) of landmarks at ranges r and bearings (K,), which may be `hidden`, or out of reach."""
     cells = np.empty((len(r), 3), np.int64)
     octave = PER_OCTAVE * (np.log2(np.maximum(r, 2.0**-NEAREST_LOG2)) + NEAREST_LOG2)
     cells[:, 0] = np.minimum(octave, RANGES - 1)
     cells[:, 1] = (bearing / (2 * math.pi) + 0.5) * BEARINGS % BEARINGS
-    cells[:, 2] = hidden
+    cells[:, 2] = hidden + 2 * ~in_reach
     return cells

@@ -17,7 +17,7 @@ from kalmark.tracks.channel import EUCLIDEAN, ROBOT, Channel, ObservationModel
 from kalmark.tracks.classes import LogClasses
 from kalmark.tracks.clones import Measurement
 from kalmark.tracks.known_landmarks import KnownLandmarks
-from kalmark.tracks.looks import Looks
+from kalmark.tracks.looks import SECTORS, SIDE, Looks
 
 Late = tuple[int, str, str, int]  # an earlier observation: time, robot, sensor, number in its scan
 ChannelKey = tuple[str, str]  # robot, sensor
@@ -74,11 +74,12 @@ class Track:
     `slot` is its block, -1 while it has none.  `observations` counts those that were used.  `searched` and `found`
     count the scans in which it was expected and observed; `hits` of `chances` are these of a tentative one, `unseen`
     the scans since it was last observed.  `seen` are the looks (`looks.py`) that saw it again, `absent` those before
-    the last of them that should have and did not, `missed` those since.  `covisible` landmarks were observed in one
-    scan with it.  `compared` counts after how many observations, and after how many changes of the map, it was last
-    compared with others.  `extent` (2,) are the abscissas of the segment observed of a line, `size_m` is the measured
-    size of a tag.  `first` is the observation that started it, and
-    `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
+    the last of them that should have and did not, `missed` those since; `reach` (SECTORS,) is how far
+    away the first ones were, by the direction from it, `beyond` (8,) the misses from farther away by side.  `covisible`
+    landmarks were observed in one scan with it.  `compared` counts after how many observations, and after how many
+    changes of the map, it was last compared with others.  `extent` (2,) are the abscissas of the segment observed of a
+    line, `size_m` is the measured size of a tag.  `first` is the observation that started it, and `measurements` are
+    kept with clones until it is confirmed; `pending` is what is known before it has a block.
     `entered` counts the changes of the map before it came into it.  `begun` are time and robot of the observation that
     began it, `last` those of the last one that was used, (0, "") of one that was given.  A tentative one may be where
     observations `of` a landmark have it that do not fit that: then `log_odds` are those that it is right, and
@@ -100,6 +101,8 @@ class Track:
     seen: int = 0
     absent: float = 0.0
     missed: float = 0.0
+    reach: Array = field(default_factory=lambda: np.zeros(SECTORS))
+    beyond: Array = field(default_factory=lambda: np.zeros(SECTORS // SIDE))
     covisible: set[Id] = field(default_factory=set)
     compared: tuple[int, int] = (0, -1)
     extent: Array | None = None
@@ -116,8 +119,11 @@ class Track:
     def restored(self) -> None:
         """Check the counts and the extent of a file.  Raises MapError."""
         counts = (self.observations, self.searched, self.found, self.hits, self.chances, self.seen)
-        if min(counts) < 0 or (self.extent is not None and self.extent.shape != (2,)):
-            raise MapError(f"{self.id!r} has the counts {counts} and the extent {self.extent}")
+        shapes = (self.reach.shape, self.beyond.shape) == ((SECTORS,), (SECTORS // SIDE,)) and (
+            self.extent is None or self.extent.shape == (2,)
+        )
+        if min(counts) < 0 or not shapes:
+            raise MapError(f"{self.id!r} has the counts {counts}, the reach {self.reach} and the extent {self.extent}")
 
 
 def _looks_invented(name: Id) -> bool:
@@ -231,6 +237,7 @@ class Tracks:
         kept.observations += gone.observations
         kept.seen, kept.absent = kept.seen + gone.seen, kept.absent + gone.absent
         kept.missed, kept.last = min(kept.missed, gone.missed), max(kept.last, gone.last)
+        kept.reach, kept.beyond = np.maximum(kept.reach, gone.reach), kept.beyond + gone.beyond
         for name in list(gone.covisible):
             if name in self.confirmed:
                 self.confirmed[name].covisible.add(kept.id)
