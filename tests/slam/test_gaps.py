@@ -151,6 +151,13 @@ def test_a_robot_lost_among_pillars_in_rows_waits_until_its_scan_fits_in_one_pla
     assert verdict.causes[0].evidence.endswith("and it was not localized again")
 
 
+def test_a_robot_whose_heading_is_unknown_is_not_kept_where_a_scan_in_rows_fitted_by_chance() -> None:
+    log = hall(8, gap_s=8.0, rows=True)
+    run = mapped(log)
+    assert right(run, log)
+    assert [gap.kind for gap in run.history.gaps] == ["increments"]  # it was not elsewhere than its covariance allows
+
+
 def adrift() -> km.Slam:
     """Return the filter of a robot that may be anywhere, heading any way, since a gap."""
     robot = km.Robot("r", km.motion.Odometry2D(), sensors=LASER, max_speed_mps=1.0, max_turn_radps=10.0)

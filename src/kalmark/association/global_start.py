@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import bdtrc
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.association.relocalization import SAME_M, SAME_RAD, align_points, is_same_pose, resect
@@ -394,5 +395,4 @@ def by_chance(of: Known, v: Array, sigma: Array, count: int, tried: int) -> floa
     """Return how many of so many poses, each right for its two pairs, have as many pairs by chance."""
     area = math.pi * chi2_gate(REACH, 2) * float(np.mean(sigma**2)) * 2.0
     p = min(1.0, of.density() * area)
-    more = range(count - 2, len(v) - 1)
-    return tried * float(sum(math.comb(len(v) - 2, k) * p**k * (1 - p) ** (len(v) - 2 - k) for k in more))
+    return tried * float(bdtrc(count - 3, len(v) - 2, p))

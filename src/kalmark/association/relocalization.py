@@ -10,9 +10,8 @@ import math
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames3d import minus
 from kalmark.geometry.rotations import from_matrix
+from kalmark.geometry.spaces import SE2, SE3
 
 SAME_M, SAME_RAD = 0.5, 0.1  # two matchings so near to each other are of one pose
 
@@ -85,6 +84,6 @@ def _resect_by_three(v: Array, l: Array) -> list[Array]:
 
 def is_same_pose(one: Array, other: Array) -> bool:
     """Return whether two poses, (3,) or (7,), are so near to each other that they are one."""
-    turn = wrap(one[2] - other[2]) if len(one) == 3 else np.linalg.norm(minus(one, other)[3:])
-    d = 2 if len(one) == 3 else 3
-    return math.dist(one[:d], other[:d]) <= SAME_M and abs(float(turn)) <= SAME_RAD
+    space = SE2 if len(one) == 3 else SE3
+    off, d = space.minus(one, other), space.d
+    return bool(np.linalg.norm(off[:d]) <= SAME_M and np.linalg.norm(off[d:]) <= SAME_RAD)

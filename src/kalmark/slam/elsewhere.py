@@ -30,8 +30,6 @@ from kalmark.association.global_start import (
 from kalmark.association.relocalization import SAME_M, is_same_pose
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
-from kalmark.geometry import frames3d
-from kalmark.geometry.angles import wrap
 from kalmark.geometry.gaussian import gate
 from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import Space
@@ -108,18 +106,16 @@ def _young(tracks: Tracks, robot: str, of: Evidence) -> list[Id]:
 def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | None) -> None:
     """Count the landmarks that a scan observed and missed, and place its robot where the odds suffice."""
     robot = scan.event.robot
-    if look is not None or scan.adrift:
+    if look is not None:
         state.evidence_of(robot)
     of, all_named = state.evidence.get(robot), None not in scan.ids
     if of is None or not scan.report.observations:
         return
     _note(state, scan, of, look)
-    if scan.adrift:
-        of.ratio, of.since_ns = -SURE, state.moving[robot].held.adrift_since_ns
     if of.ratio >= 0.0 and all_named:
         del state.evidence[robot]
     if of.ratio <= -SURE:
-        old, is_look = _old(state, scan, of), look is not None or scan.adrift or all_named
+        old, is_look = older(state, scan, of), look is not None or all_named
         is_tried = of.fitted and robot in state.pose_hypotheses
         if is_look and not is_tried:
             _propose(state, scan, of, old)
@@ -155,7 +151,7 @@ def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | N
     return np.log(np.maximum(np.where(np.isfinite(chance), chance, 1.0), math.exp(-SURE)))
 
 
-def _old(state: State, scan: ScanContext, of: Evidence) -> Known:
+def older(state: State, scan: ScanContext, of: Evidence) -> Known:
     """Return the landmarks that were in the map before, as they are now; a ray as a point, if its depth is known."""
     tracks, young, channel = state.tracks, _young(state.tracks, scan.event.robot, of), scan.channel
     kind = channel.landmark.kind if channel.gives_places else EUCLIDEAN[scan.dimensions - 2]
@@ -197,7 +193,7 @@ def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[
     return [ids[k] for k in nearest], v[nearest], rows[nearest, -1], o[nearest]
 
 
-def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposal | None:
+def locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposal | None:
     """Return where a constellation is one of old landmarks, if there is one such place."""
     if scan.channel.landmark.kind == "tag":
         v, V = scan.channel.calibrated(scan.map).invert(scan.y)
@@ -213,7 +209,7 @@ def _locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Propos
 
 def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     """Begin a second hypothesis where a constellation is one of old landmarks."""
-    found, name, r = _locate(state, scan, of, old), scan.event.robot, state.map.mean(scan.robot)
+    found, name, r = locate(state, scan, of, old), scan.event.robot, state.map.mean(scan.robot)
     if found is None:
         return
     other = state.pose_hypotheses[name] = PoseHypothesis.of(
@@ -259,8 +255,8 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         logs = existence.log_misses(view, old, state.policies[scan.key].upkeep) | logs
     of.count(logs)
     if of.gain - of.ratio >= math.log(ODDS) and fits:
-        again = _locate(state, scan, of, old) if None in scan.ids else None
-        if None not in scan.ids or (again and is_same_pose(again.T, channel.pose(other.map, scan.robot))):
+        pose = channel.pose(other.map, scan.robot)
+        if None not in scan.ids or ((again := locate(state, scan, of, old)) and is_same_pose(again.T, pose)):
             _place(state, scan, of, other, [*fits])
     elif of.gain <= -SURE:
         del state.pose_hypotheses[robot]
@@ -310,14 +306,10 @@ def report_found(state: State, scan: ScanContext, since_ns: int, before: Array) 
     robot, after, d = scan.event.robot, state.map.mean(scan.robot), scan.dimensions
     for others in (state.pose_hypotheses, state.sums, state.evidence):
         others.pop(robot, None)
-    if not scan.adrift:  # else the gap since which it is has been reported
-        turned = (
-            abs(float(wrap(after[2] - before[2])))
-            if d == 2
-            else float(np.linalg.norm(frames3d.minus(after[:7], before[:7])[3:]))
-        )
-        moved = math.dist(after[:d], before[:d])
-        scan.report.gaps += (Gap(robot, ELSEWHERE, since_ns, scan.event.t_ns, moved, turned),)
+    pose = state.moving[robot].motion.space.pose
+    off = pose.minus(after[: pose.size], before[: pose.size])
+    moved, turned = (float(np.linalg.norm(part)) for part in (off[:d], off[d:]))
+    scan.report.gaps += (Gap(robot, ELSEWHERE, since_ns, scan.event.t_ns, moved, turned),)
 
 
 def _mapped_again(

@@ -46,7 +46,6 @@ class Gaps:
     intervals: tuple[int, ...]
     pending: tuple[tuple[int, Array], ...]
     largest: Array  # of an increment: per second
-    adrift_since_ns: int
     adrift: bool  # whether the pose may be anywhere since a gap
 
     def __init__(
@@ -57,7 +56,7 @@ class Gaps:
         self.limited = action != "ignore" and (max_speed_mps, max_turn_radps) != (None, None)
         self.last_ns = self.since_ns = self.left_out_ns = self.bound_ns = None
         self.until_ns, self.usual_ns, self.intervals, self.pending, self.adrift = 0, 0, (), (), False
-        self.largest, self.adrift_since_ns = np.zeros(len(motion.columns)), 0
+        self.largest = np.zeros(len(motion.columns))
         self.late_ns = NEVER_NS  # after which the next is late
         self.noticed: Gap | None = None
 
@@ -146,8 +145,7 @@ class Gaps:
         D, self.until_ns = self._reached(ends_ns) - self._reached(self.until_ns), ends_ns
         if self.action == "ignore":
             D[:] = 0.0
-        if not self.adrift:
-            self.adrift, self.adrift_since_ns = bool(D.any()), self.last_ns
+        self.adrift = self.adrift or bool(D.any())
         kind, start_ns = "held" if self.motion.held else "increments", self.last_ns
         if self.left_out_ns is not None:
             kind, start_ns = "ruled_out", self.left_out_ns

@@ -190,11 +190,6 @@ class HeldInput:
         """True if its pose may be anywhere since a gap."""
         return self.gaps is not None and self.gaps.adrift
 
-    @property
-    def adrift_since_ns(self) -> int:
-        """The time of the gap since which its pose may be anywhere."""
-        return self.gaps.adrift_since_ns if self.gaps is not None else 0
-
     def recovered(self) -> None:
         """Take note that its heading is known again."""
         if self.gaps is not None:

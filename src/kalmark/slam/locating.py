@@ -8,7 +8,7 @@ linearisation does not hold over the robot's covariance until it holds over that
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -27,6 +27,8 @@ from kalmark.geometry.gaussian import gate
 from kalmark.models.observe import linearize
 from kalmark.models.protocols import distances_alone, place_of
 from kalmark.report import JudgedScan, Observation
+from kalmark.slam import elsewhere
+from kalmark.slam.evidence import Evidence
 from kalmark.slam.gaussian_sum import (
     IN_A_ROW,
     NOWHERE,
@@ -246,12 +248,27 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
     state.clones.forget_current(name)
 
 
-def note_adrift(state: State, scan: ScanContext) -> None:
-    """Take note whether a gap leaves the heading of a scan's robot unknown."""
+def decide(
+    state: State, scan: ScanContext, query: Query, decide: Callable[[Query], Sequence[Decision]]
+) -> Sequence[Decision]:
+    """Return the decisions on a scan; a robot of unknown heading is first moved to where its scan fits.
+
+    It stays there if the association recognises a landmark from there.
+    """
     held = state.moving[scan.event.robot].held
     if held.is_adrift and (len(scan.pose()) != 3 or turn_holds(_covariance(state, scan))):
         held.recovered()
     scan.adrift = held.is_adrift
+    if not (scan.adrift and scan.locates):
+        return decide(query)
+    alone, before = Evidence(since_ns=scan.event.t_ns), state.map.mean(scan.robot)
+    if found := elsewhere.locate(state, scan, alone, elsewhere.older(state, scan, alone)):
+        _put(state, scan, found.T)
+        decisions = decide(query)
+        if any(state.tracks.sort(name) for name, _ in decisions):
+            return decisions
+        state.map.set_predicted(scan.robot, before)
+    return decide(query)
 
 
 def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:

@@ -83,7 +83,7 @@ def maintain(state: State, scan: ScanContext, policy: Policy) -> None:
         ):
             state.remove(track.id)
             report.removed += ((track.id, f"should be in view and was not seen, {round(track.missed)} scans in a row"),)
-    if scan.locates:
+    if scan.locates and not scan.adrift:
         elsewhere.weigh(state, scan, look)
     if ids is None or None in ids:
         merging.merge_seen(state, scan, policy)

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -341,8 +342,7 @@ class Slam(Estimate):
             scan.report.observations = located.fates or waits
             return
         if located is None:
-            locating.note_adrift(state, scan)
-            decisions = self._decided(policy, query)
+            decisions = locating.decide(state, scan, query, partial(self._decided, policy))
         else:
             query = Query(scan)
             decisions = self._decided(policy, query, located.decisions)
