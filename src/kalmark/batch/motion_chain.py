@@ -194,7 +194,7 @@ class Chain:
             course.add(part, self.roots)
         if course.moves:
             self._enter(robot, course.node, course.moved, course)
-            course.drive.located(t_ns)
+            course.drive.located(t_ns, False)
         return course.node
 
     def _enter(self, robot: str, previous: int, step: Array, course: Course) -> None:

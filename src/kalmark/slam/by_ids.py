@@ -56,7 +56,7 @@ def correct_by_ids(state: State, event: Scan, channel: Channel, policy: Policy) 
     report.judged = (judged,)
     tracks.count(ids, used, (event.t_ns, name))
     if report.gaps and any(used):
-        moving.held.located(event.t_ns)
+        moving.held.located(event.t_ns, False)
     if scan is not None:
         scan.add_reports(ids, judged.rows, used)
         if policy.contests:

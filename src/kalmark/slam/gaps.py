@@ -123,10 +123,11 @@ class Gaps:
             sizes /= np.maximum(times, max(self.usual_ns, 1))[:, None] * 1e-9
         self.largest, self.pending = np.maximum(self.largest, sizes.max(axis=0)), ()
 
-    def located(self, t_ns: int) -> None:
-        """Take note that the pose was corrected: the motion is unknown from then on."""
+    def located(self, t_ns: int, is_heading_known: bool) -> None:
+        """Take note that the pose was corrected: the motion is unknown from then on, the pose if its heading is."""
         if self.since_ns is not None:
             self.since_ns = self.until_ns = t_ns
+        self.adrift = self.adrift and not is_heading_known
 
     def unknown(self, t_ns: int, u: Array | None = None) -> Array | None:
         """Return the covariance (dof, dof) of the motion that is unknown up to a time, None if it is known.

@@ -180,20 +180,15 @@ class HeldInput:
         gap, self.gaps.noticed = self.gaps.noticed, None
         return (gap,)
 
-    def located(self, t_ns: int) -> None:
-        """Take note that the pose was corrected."""
+    def located(self, t_ns: int, is_heading_known: bool) -> None:
+        """Take note that the pose was corrected, and whether its heading is known again."""
         if self.gaps is not None:
-            self.gaps.located(t_ns)
+            self.gaps.located(t_ns, is_heading_known)
 
     @property
     def is_adrift(self) -> bool:
         """True if its pose may be anywhere since a gap."""
         return self.gaps is not None and self.gaps.adrift
-
-    def recovered(self) -> None:
-        """Take note that its heading is known again."""
-        if self.gaps is not None:
-            self.gaps.adrift = False
 
     def lags(self, t_ns: int) -> bool:
         """Return whether the pose of a robot is still that before a time: nothing has read it since."""

@@ -70,17 +70,17 @@ def locate_in_known_map(state: State, scan: ScanContext, query: Query) -> Locate
     """
     if scan.dimensions != 2 or not (state.tracks.known or state.surveys.trial):
         return None
-    name, P = scan.event.robot, _covariance(state, scan)
+    name = scan.event.robot
     sum_ = state.sums.get(name)
     shown = sum_ is not None and sum_.shows
     if scan.channel.gives_places:
-        if len(state.tracks.known) < FEWEST or (not shown and turn_holds(P)):
+        if len(state.tracks.known) < FEWEST or (not shown and is_heading_known(scan)):
             return None
         return _locate(state, query)
     if not can_be_summed(scan.channel):
         return None
     if sum_ is None or not shown:
-        is_turn, bent = turn_holds(P), _nonlinear_axes(state, scan)
+        is_turn, bent = is_heading_known(scan), _nonlinear_axes(state, scan)
         if bent is None:
             return None if is_turn or len(state.tracks.known) < FEWEST else Located(UNNAMED)
         is_distance = distances_alone(scan.channel.sensor)
@@ -179,11 +179,6 @@ def is_doubted(state: State, scan: ScanContext) -> bool:
     return True
 
 
-def _covariance(state: State, scan: ScanContext) -> Array:
-    """Return the covariance (3, 3) of the pose of a scan's robot, of the plane."""
-    return state.map.covariance([scan.robot])[:3, :3]
-
-
 def _gate(scan: ScanContext) -> float:
     return gate(SURVEYED, scan.channel.dof)
 
@@ -229,7 +224,7 @@ def _summed(state: State, scan: ScanContext, sum_: GaussianSum) -> Located:
             state.tracks.known.count([name], [True])
     _show(state, scan, sum_)
     for _, one in seen:
-        holds = turn_holds(_covariance(state, scan)) and not _bent_axes(state.map, scan, one.update).any()
+        holds = is_heading_known(scan) and not _bent_axes(state.map, scan, one.update).any()
         sum_.linear = sum_.linear + 1 if holds else 0
     if sum_.linear >= IN_A_ROW:
         del state.sums[robot]
@@ -255,10 +250,7 @@ def decide(
 
     It stays there if the association recognises a landmark from there.
     """
-    held = state.moving[scan.event.robot].held
-    if held.is_adrift and (len(scan.pose()) != 3 or turn_holds(_covariance(state, scan))):
-        held.recovered()
-    scan.adrift = held.is_adrift
+    scan.adrift = state.moving[scan.event.robot].held.is_adrift and not is_heading_known(scan)
     if not (scan.adrift and scan.locates):
         return decide(query)
     alone, before = Evidence(since_ns=scan.event.t_ns), state.map.mean(scan.robot)
@@ -269,6 +261,11 @@ def decide(
             return decisions
         state.map.set_predicted(scan.robot, before)
     return decide(query)
+
+
+def is_heading_known(scan: ScanContext) -> bool:
+    """Return whether a correction may be linearised at the heading of a scan's robot; of a robot of space it is."""
+    return len(scan.pose()) != 3 or turn_holds(scan.map.covariance([scan.robot])[:3, :3])
 
 
 def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Array) -> None:

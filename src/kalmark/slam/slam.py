@@ -317,8 +317,9 @@ class Slam(Estimate):
             report.observations = tuple(Observation(k, i, "ignored", None, None, why) for k, i in enumerate(ids))
         elif len(event.y):
             self._fuse(scan, policy)
-            if gaps and any(o.outcome == "associated" for o in report.observations):
-                state.moving[event.robot].held.located(event.t_ns)
+            held = state.moving[event.robot].held
+            if (gaps or held.is_adrift) and any(o.outcome == "associated" for o in report.observations):
+                held.located(event.t_ns, locating.is_heading_known(scan))
         maintenance.maintain(state, scan, policy)
         if channel.counts:
             with suppress(MapError):  # it is full: the next scan is the first again
