@@ -72,7 +72,7 @@ def test_the_detection_probability_is_a_product_of_what_ranges_bearings_and_hidi
     places = [(r, b, h) for r in (3.0, 12.0) for b in (0.0, 3.0) for h in (False, True)]
     shares = [(r, b, h, (0.8 if r < 5 else 0.2) * (1.0 if b < 1 else 0.0) * (0.5 if h else 1.0)) for r, b, h in places]
     looks, cells = looked_at(shares, 1000)
-    p = looks.detection()[tuple(cells.T)]
+    p = looks.detection()[0][tuple(cells.T)]
     np.testing.assert_allclose(p, [share for *_, share in shares], atol=0.01)
 
 

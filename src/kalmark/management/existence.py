@@ -112,7 +112,9 @@ def look(scan: ScanContext, upkeep: Upkeep) -> ObservedAndMissed | None:
                 track.beyond[sectors[i] // SIDE] += 0.0 if there[i] or in_reach[i] else weights[i]
         far = float(r[there].mean()) if there.any() else far
         if usual:
-            looks.count(cells[clear], there[clear])
+            before = [name not in tracks.confirmed or tracks.confirmed[name].seen > 0 for name in names]
+            sure = clear & (there | np.array(before, dtype=np.bool_))  # of ghosts nothing is learnt
+            looks.count(cells[sure], there[sure])
         missed |= {names[i]: float(weights[i]) for i in np.flatnonzero(clear & ~there & (weights > 0.0)).tolist()}
     if usual:
         looks.take(pose, tracks.changes, far)

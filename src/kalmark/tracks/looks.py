@@ -26,7 +26,7 @@ CELLS = (
     4,
 )  # the last ones: nothing stands nearer, something does; the same from where it was not seen yet
 HIDDEN = 0.1, 5.0  # of landmarks are hidden from another direction; looks that this is worth
-SECTORS, SIDE = 24, 3  # of directions from a landmark to a sensor, and of one of its eight sides
+SECTORS, SIDE = 24, 2  # of directions from a landmark to a sensor, and of one of its twelve sides
 ROUNDS = 4  # in which the factors of the detection probability are fitted
 MOST = 0.98  # of a detection probability
 
@@ -75,17 +75,18 @@ class Looks:
         It is log(1 - p) / log(1 - q), p the detection probability there and q that of what is seen.
         """
         if (self.taken < AGAIN or self.taken % AGAIN == 0) and self.counts[0].any():
-            p = self.detection()
+            p, hidden = self.detection()
             self.log_miss = math.log1p(-min(float((self.counts[0] * p).sum() / self.counts[0].sum()), MOST))
             self.table = np.log1p(-np.minimum(p, -math.expm1(self.log_miss))) / self.log_miss
-            self.most = math.log(self._hidden()) / self.log_miss
+            self.most = math.log(hidden) / self.log_miss
         return np.asarray(self.table[tuple(cells.T)])
 
-    def detection(self) -> Array:
+    def detection(self) -> tuple[Array, float]:
         """Return the detection probability (*CELLS,): a factor by the range, one by the bearing, one by what may hide.
 
         Each is what is seen there over what the others expect.  Where nothing is known it is a half by the range, and
-        the others change nothing.
+        the others change nothing.  With it comes the probability that something hides a landmark on a side from where
+        it was not seen yet: what is not seen there of what the others expect, `HIDDEN` before that is known.
         """
         seen, expected = self.counts
         r, b, h = (np.ones(n) for n in CELLS)
@@ -93,16 +94,9 @@ class Looks:
             r = (seen.sum((1, 2)) + 0.5) / (expected @ h @ b + 1.0)
             b = (seen.sum((0, 2)) + 0.5) / (r @ (expected @ h) + 0.5)
             h = (seen.sum((0, 1)) + 0.5) / (b @ np.tensordot(r, expected, 1) + 0.5)
-        return np.minimum(r[:, None, None] * b[:, None] * h, MOST)
-
-    def _hidden(self) -> float:
-        """Return the probability that something hides a landmark from a direction from which it was not seen yet.
-
-        It is `HIDDEN` before anything is known of that, as from so many looks.
-        """
-        seen, expected = self.counts.sum((1, 2))
-        hidden = max(expected[2] - seen[2] * (expected[0] + 0.5) / (seen[0] + 0.5), 0.0)
-        return float((hidden + HIDDEN[0] * HIDDEN[1]) / (expected[2] + HIDDEN[1]))
+        there = float((b @ np.tensordot(r, expected, 1) * h[0])[2])
+        q = (max(there - float(seen[..., 2].sum()), 0.0) + HIDDEN[0] * HIDDEN[1]) / (there + HIDDEN[1])
+        return np.minimum(r[:, None, None] * b[:, None] * h, MOST), q
 
     def count(self, cells: Index, seen: Flags) -> None:
         """Count what was seen (K,) of what was expected in these cells (K, 3)."""
