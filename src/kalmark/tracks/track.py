@@ -76,10 +76,10 @@ class Track:
     the scans since it was last observed.  `seen` are the looks (`looks.py`) that saw it again, `absent` those before
     the last of them that should have and did not, `missed` those since; `reach` (SECTORS,) is how far
     away the first ones were, by the direction from it, `beyond` (12,) the misses from farther away by side.
-    `covisible` landmarks were observed in one scan with it.  `compared` counts after how many observations, and after how many
-    changes of the map, it was last compared with others.  `extent` (2,) are the abscissas of the segment observed of a
-    line, `size_m` is the measured size of a tag.  `first` is the observation that started it, and `measurements` are
-    kept with clones until it is confirmed; `pending` is what is known before it has a block.
+    `covisible` landmarks were observed in one scan with it.  `compared` counts after how many observations, and after
+    how many changes of the map, it was last compared with others.  `extent` (2,) are the abscissas of the segment
+    observed of a line, `size_m` is the measured size of a tag.  `first` is the observation that started it, and
+    `measurements` are kept with clones until it is confirmed; `pending` is what is known before it has a block.
     `entered` counts the changes of the map before it came into it.  `begun` are time and robot of the observation that
     began it, `last` those of the last one that was used, (0, "") of one that was given.  A tentative one may be where
     observations `of` a landmark have it that do not fit that: then `log_odds` are those that it is right, and
