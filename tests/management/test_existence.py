@@ -128,3 +128,32 @@ def test_a_table_of_landmarks_has_the_marks_and_a_known_map_leaves_them_out(tmp_
     back = MapLandmarks.read(path)
     assert (back.log_odds, back.unseen) == (table.log_odds, table.unseen)
     assert [landmark.id for landmark in read_known(path)] == ["a"]
+
+
+def test_few_posts_at_a_wall_are_marked_from_behind_it_and_all_once_they_are_taken_away() -> None:
+    """The wall hides them from the north, six sides of twelve; trees stand about, and are seen from everywhere."""
+    rng = np.random.default_rng(3)
+    posts = np.column_stack([np.linspace(-6.0, 6.0, 7), np.zeros(7)])
+    trees = np.array([(x, y) for x in (-9.0, -3.0, 3.0, 9.0) for y in (-7.0, 7.0)])
+    lidar = km.sensors.RangeBearing(0.03, 0.005, range_max_m=12.0)
+    for stay in (True, False):
+        rover = km.Robot(
+            "rover", km.motion.Odometry2D(0.005, 0.005, 0.002), (8.0, 0, np.pi / 2), {"lidar": km.Mount(lidar)}
+        )
+        slam, pose, marked = km.Slam(rover, association=km.association.Automatic()), np.array([8.0, 0.0, np.pi / 2]), []
+        for k in range(1200):
+            a = 2.0 * np.pi * k / 200.0  # round the wall, and at last to and fro behind it
+            a = np.pi * (0.1 + 0.8 * abs((k - 600) / 100.0 % 2.0 - 1.0)) if stay and k >= 700 else a
+            now = np.array([8.0 * np.cos(a), 3.5 * np.sin(a), np.arctan2(3.5 * np.cos(a), -8.0 * np.sin(a))])
+            u = km.geometry.compose(km.geometry.inverse(pose)[0], now)[0] if k else np.zeros(3)
+            pose = now
+            slam.process(km.Control(0.1 * k, "rover", u + rng.normal(0.0, (0.002, 0.002, 0.001))))
+            shown = np.concatenate([posts if now[1] < 0.0 and (stay or k < 400) else posts[:0], trees])
+            y = km.geometry.observe(now, shown)[0] + rng.normal(0.0, (0.03, 0.005), (len(shown), 2))
+            slam.process(km.Scan(0.1 * k, "rover", "lidar", y[y[:, 0] < 12.0]))
+        table = slam.landmarks()
+        marked = [
+            np.abs(mean[1]) < 1.0 for name, mean in zip(table.ids, table.means, strict=True) if name in table.unseen
+        ]
+        assert len(table) >= len(posts) + len(trees) - 1
+        assert len(marked) <= 2 if stay else (all(marked) and len(marked) == 7)
