@@ -1,6 +1,7 @@
 """The pose that observed points or directions and landmarks in pairs determine in closed form.
 
-Points, l = T v: Umeyama 1991.  Directions: Hartley and Zisserman, Multiple View Geometry 7; Grunert 1841.
+Points, l = T v: Umeyama 1991.  Directions: in the plane by least squares, a quartic in exp(i theta); in space by three
+of them, Grunert 1841.
 """
 
 from __future__ import annotations

@@ -72,8 +72,7 @@ def _value(finding: Finding) -> str:
 
 def _sure(finding: Finding) -> str:
     """Return of how many sigmas a finding is, behind its value; nothing if it was not found by them."""
-    sure = finding.sigma and f"{figure(min(abs(finding.value) / finding.sigma, MOST_SIGMAS), 2)}"
-    return f" ({sure} sigma)" if sure else ""
+    return f" ({figure(min(abs(finding.value) / finding.sigma, MOST_SIGMAS), 2)} sigma)" if finding.sigma > 0 else ""
 
 
 def _sensor(finding: Finding) -> str:

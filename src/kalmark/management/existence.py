@@ -113,8 +113,8 @@ def look(scan: ScanContext, upkeep: Upkeep) -> ObservedAndMissed | None:
         far = float(r[there].mean()) if there.any() else far
         if usual:
             before = [name not in tracks.confirmed or tracks.confirmed[name].seen > 0 for name in names]
-            sure = clear & (there | np.array(before, dtype=np.bool_))  # of ghosts nothing is learnt
-            looks.count(cells[sure], there[sure])
+            counts = clear & (there | np.array(before, dtype=np.bool_))  # of ghosts nothing is learnt
+            looks.count(cells[counts], there[counts])
         missed |= {names[i]: float(weights[i]) for i in np.flatnonzero(clear & ~there & (weights > 0.0)).tolist()}
     if usual:
         looks.take(pose, tracks.changes, far)

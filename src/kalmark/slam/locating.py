@@ -244,7 +244,7 @@ def _show(state: State, scan: ScanContext, sum_: GaussianSum) -> None:
 
 
 def decide(
-    state: State, scan: ScanContext, query: Query, decide: Callable[[Query], Sequence[Decision]]
+    state: State, scan: ScanContext, query: Query, associate: Callable[[Query], Sequence[Decision]]
 ) -> Sequence[Decision]:
     """Return the decisions on a scan; a robot of unknown heading is first moved to where its scan fits.
 
@@ -252,15 +252,15 @@ def decide(
     """
     scan.adrift = state.moving[scan.event.robot].held.is_adrift and not is_heading_known(scan)
     if not (scan.adrift and scan.locates):
-        return decide(query)
+        return associate(query)
     alone, before = Evidence(since_ns=scan.event.t_ns), state.map.mean(scan.robot)
     if found := elsewhere.locate(state, scan, alone, elsewhere.older(state, scan, alone)):
         _put(state, scan, found.T)
-        decisions = decide(query)
+        decisions = associate(query)
         if any(state.tracks.sort(name) for name, _ in decisions):
             return decisions
         state.map.set_predicted(scan.robot, before)
-    return decide(query)
+    return associate(query)
 
 
 def is_heading_known(scan: ScanContext) -> bool:

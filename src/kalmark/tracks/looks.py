@@ -1,9 +1,10 @@
 """Detection probability of a sensor over its field of view, counted in scans from different poses (looks).
 
 A look is a scan from another pose than the last one, or after many from one pose: scans in a row miss a landmark for
-the same reason.  The detection probability is a product of three factors, by the range, by the bearing and by whether
-an object stands nearer, so that a chance where little is seen (beyond a detector's reach, behind it, behind a tree)
-counts for little.  Each factor is what is seen over what the other two expect there (Deming and Stephan 1940).
+the same reason.  The detection probability is a product of three factors, by the range, by the bearing and by what may
+hide a landmark (an object that stands nearer; a side from where it was not seen yet), so that a chance where little is
+seen (beyond a detector's reach, behind it, behind a tree) counts for little.  Each factor is what is seen over what the
+other two expect there (Deming and Stephan 1940).
 """
 
 from __future__ import annotations
@@ -20,11 +21,7 @@ from kalmark.geometry.pose_frames import FRAMES
 MOVED, TURNED_RAD, STANDING = 0.1, 0.2, 20  # of the range; a turn; scans of a sensor that stands: another look
 PER_OCTAVE, NEAREST_LOG2, RANGES, BEARINGS = 4, 8, 80, 24  # of ranges, from 2^-8 m on; sectors of bearings
 AGAIN = 8  # looks until what a miss counts is estimated again, but for the first ones
-CELLS = (
-    RANGES,
-    BEARINGS,
-    4,
-)  # the last ones: nothing stands nearer, something does; the same from where it was not seen yet
+CELLS = RANGES, BEARINGS, 4  # the last: nothing stands nearer, or something; both again where it was not seen from yet
 HIDDEN = 0.1, 5.0  # of landmarks are hidden from another direction; looks that this is worth
 SECTORS, SIDE = 24, 2  # of directions from a landmark to a sensor, and of one of its twelve sides
 ROUNDS = 4  # in which the factors of the detection probability are fitted
