@@ -20,7 +20,7 @@ from kalmark.batch.solver import Batch, optimum
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
-from kalmark.geometry.pose_frames import FRAMES
+from kalmark.geometry.pose_frames import carried_along
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.logs.progress import track
 from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
@@ -196,9 +196,8 @@ def _moved(history: History, again: Mapping[str, Restart]) -> Array:
     for gap in history.carried():
         lost, found = np.flatnonzero(history.while_carried(gap)), np.searchsorted(history.t_ns, gap.end_ns)
         before = poses[lost].copy()
-        to = FRAMES[poses.shape[1]]
         for step, pose in zip(lost, before, strict=True):
-            poses[step] = to.compose(poses[found], to.compose(to.inverse(before[-1])[0], pose)[0])[0]
+            poses[step] = carried_along(pose, before[-1], poses[found])
     return poses
 
 
