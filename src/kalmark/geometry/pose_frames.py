@@ -16,10 +16,10 @@ FRAMES: dict[int, Any] = {3: frames, 7: frames3d}
 ORIGIN = {3: np.zeros(3), 7: np.array([0.0, 0, 0, 0, 0, 0, 1])}
 
 
-def carried_along(pose: Array, before: Array, after: Array) -> Array:
+def moved_with(pose: Array, before: Array, after: Array) -> Array:
     """Return a pose, (3,) or (7,), after another one that is rigidly connected with it moves from `before` to `after`.
 
-    >>> km.geometry.pose_frames.carried_along(np.array([3.0, 2.0, 0.0]), np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    >>> km.geometry.pose_frames.moved_with(np.array([3.0, 2.0, 0.0]), np.zeros(3), np.array([1.0, 0.0, 0.0]))
     array([4., 2., 0.])
     """
     of_world = FRAMES[len(pose)]

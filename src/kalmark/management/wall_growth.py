@@ -81,16 +81,12 @@ def find_coincident_wall(
         across = np.abs(along[:, 0] * along[i, 1] - along[:, 1] * along[i, 0])
         near = (gap(others, t[i : i + 1]) <= model.join_m) & (across < math.sin(TURNED_RAD))
         for j in np.flatnonzero(near).tolist():
-            if j == i or _told_apart(tracks, walls[i], walls[j]):
+            if j == i or not any(tracks.is_invented(walls[k].id) for k in (i, j)):  # two ids are two walls
                 continue
             ratio = _log_ratio(map_, walls[i], walls[j], _between(t[i], others[j]), chance)
             if ratio >= math.log(odds):
                 return Merge([(walls[i].id, walls[j].id)], ratio)
     return None
-
-
-def _told_apart(tracks: Tracks, one: Track, other: Track) -> bool:
-    return not (tracks.is_invented(one.id) or tracks.is_invented(other.id))  # two ids are two walls
 
 
 def _between(one: Array, other: Array) -> float:

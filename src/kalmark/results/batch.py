@@ -20,7 +20,7 @@ from kalmark.batch.solver import Batch, optimum
 from kalmark.errors import KalmarkError
 from kalmark.events import Event, Id, Scan
 from kalmark.geometry.frames3d import from_frame, minus
-from kalmark.geometry.pose_frames import carried_along
+from kalmark.geometry.pose_frames import moved_with
 from kalmark.geometry.spaces import SCALAR, VECTOR, VECTOR3
 from kalmark.logs.progress import track
 from kalmark.models.landmarks import Point2D, Point3D, Tag, Wall2D
@@ -197,7 +197,7 @@ def _moved(history: History, again: Mapping[str, Restart]) -> Array:
         lost, found = np.flatnonzero(history.while_carried(gap)), np.searchsorted(history.t_ns, gap.end_ns)
         before = poses[lost].copy()
         for step, pose in zip(lost, before, strict=True):
-            poses[step] = carried_along(pose, before[-1], poses[found])
+            poses[step] = moved_with(pose, before[-1], poses[found])
     return poses
 
 

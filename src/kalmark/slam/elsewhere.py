@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from kalmark.association.relocalization import SAME_M, is_same_pose
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry.gaussian import gate
-from kalmark.geometry.pose_frames import FRAMES
+from kalmark.geometry.pose_frames import FRAMES, moved_with
 from kalmark.geometry.spaces import Space
 from kalmark.management import existence
 from kalmark.management.reparametrize import POINTS
@@ -215,9 +216,8 @@ def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     other = state.pose_hypotheses[name] = PoseHypothesis.of(
         state.map, state.moving[name], state.blocks, scan.event.t_ns
     )
-    of_world = FRAMES[len(scan.channel.at)]
-    to_robot = of_world.compose(of_world.inverse(scan.pose())[0], r[: len(found.T)])[0]
-    write_robot(other.map, other.moving, of_world.compose(found.T, to_robot)[0], found.cov)
+    pose = moved_with(r[: len(found.T)], scan.pose(), found.T)
+    write_robot(other.map, other.moving, pose, found.cov)
     of.gain, of.fitted = found.gain, {old.names[row]: 0.0 for row in found.matched if row >= 0}
 
 
@@ -242,22 +242,22 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
     other, model = state.pose_hypotheses[robot], channel.models[old.model.kind]
     view, places = replace(scan, map=other.map), channel.places(other.map, scan.robot, scan.y)
     pairs = _pair(scan, places, old) if len(old.names) else {}
-    logs, fits = dict[Id, float](), dict[Id, int]()
+    logs, fits = dict[Id, float](), list[Id]()
     if pairs:
         names, rows = [old.names[row] for row in pairs], [*pairs.values()]
         update = view.known_update(model, old.values[[*pairs]], rows)._replace(gate=gate(SURVEYED, channel.dof))
         done = state.estimator.for_fixes().correct(other.map, update._replace(R=LOOSE**2 * update.R))
         gains = np.where(done.fused, -_log_chance(scan, rows, old.density(), done.Z), -SURE)
-        fits = {name: k for name, k, fits in zip(names, rows, done.fused.tolist(), strict=True) if fits}
-        counts = [name in fits or scan.ids[k] is not None for name, k in zip(names, rows, strict=True)]
-        logs = {name: gain for name, gain, yes in zip(names, gains.tolist(), counts, strict=True) if yes}
+        fits = [*compress(names, done.fused)]
+        each = zip(names, rows, gains.tolist(), done.fused.tolist(), strict=True)
+        logs = {name: gain for name, k, gain, is_one in each if is_one or scan.ids[k] is not None}
     if None in scan.ids:
         logs = existence.log_misses(view, old, state.policies[scan.key].upkeep) | logs
     of.count(logs)
     if of.gain - of.ratio >= math.log(ODDS) and fits:
         pose = channel.pose(other.map, scan.robot)
         if None not in scan.ids or ((again := locate(state, scan, of, old)) and is_same_pose(again.T, pose)):
-            _place(state, scan, of, other, [*fits])
+            _place(state, scan, of, other, fits)
     elif of.gain <= -SURE:
         del state.pose_hypotheses[robot]
         of.fitted, of.gain = {}, 0.0

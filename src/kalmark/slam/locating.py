@@ -16,14 +16,13 @@ import numpy as np
 
 from kalmark.arrays import Array, Flags
 from kalmark.association.global_start import FEWEST, FEWEST_NAMED, locate_points, locate_rays, rows_of
-from kalmark.association.protocol import NEW, Decision
+from kalmark.association.protocol import DEFERRED, NEW, Decision
 from kalmark.association.query import Query
 from kalmark.events import Id
 from kalmark.filter.estimators import Update
 from kalmark.filter.map import Map
-from kalmark.geometry import frames3d
-from kalmark.geometry.frames import compose, inverse
 from kalmark.geometry.gaussian import gate
+from kalmark.geometry.pose_frames import moved_with
 from kalmark.models.observe import linearize
 from kalmark.models.protocols import distances_alone, place_of
 from kalmark.report import JudgedScan, Observation
@@ -248,19 +247,21 @@ def decide(
 ) -> Sequence[Decision]:
     """Return the decisions on a scan; a robot of unknown heading is first moved to where its scan fits.
 
-    It stays there if the association recognises a landmark from there.
+    That is by the landmarks that are recognised, or by distances.  It stays there if a landmark is recognised from
+    there; what is recognised from elsewhere is deferred: no correction can be linearised there.
     """
     scan.adrift = state.moving[scan.event.robot].held.is_adrift and not is_heading_known(scan)
     if not (scan.adrift and scan.locates):
         return associate(query)
-    alone, before = Evidence(since_ns=scan.event.t_ns), state.map.mean(scan.robot)
-    if found := elsewhere.locate(state, scan, alone, elsewhere.older(state, scan, alone)):
+    alone, before, decisions = Evidence(since_ns=scan.event.t_ns), state.map.mean(scan.robot), associate(query)
+    ids: tuple[Any, ...] = tuple(name if state.tracks.sort(name) else None for name, _ in decisions)
+    if found := elsewhere.locate(state, replace(scan, ids=ids), alone, elsewhere.older(state, scan, alone)):
         _put(state, scan, found.T)
-        decisions = associate(query)
-        if any(state.tracks.sort(name) for name, _ in decisions):
-            return decisions
+        moved = associate(query)
+        if any(state.tracks.sort(name) for name, _ in moved):
+            return moved
         state.map.set_predicted(scan.robot, before)
-    return associate(query)
+    return [(DEFERRED, UNNAMED)] * len(decisions) if {*ids} != {None} else decisions
 
 
 def is_heading_known(scan: ScanContext) -> bool:
@@ -272,8 +273,7 @@ def relocate_robot(state: State, channel: Channel, name: str, T: Array, cov: Arr
     """Put a robot of space where its sensor is at T (7,), with the covariance (6, 6), wherever it was."""
     moving = state.moving[name]
     r = state.map.mean(moving.slot)[:7]
-    to_robot = frames3d.compose(frames3d.inverse(channel.pose(state.map, moving.slot))[0], r)[0]
-    write_robot(state.map, moving, frames3d.compose(T, to_robot)[0], cov)
+    write_robot(state.map, moving, moved_with(r, channel.pose(state.map, moving.slot), T), cov)
     state.clones.forget_current(name)
 
 
@@ -290,5 +290,4 @@ def _put(state: State, scan: ScanContext, T: Array) -> None:
     Its mean alone: its covariance includes that pose.
     """
     r = state.map.mean(scan.robot)
-    pose = compose(T, compose(inverse(scan.pose())[0], r[:3])[0])[0]
-    state.map.set_predicted(scan.robot, np.append(pose, r[3:]))
+    state.map.set_predicted(scan.robot, np.append(moved_with(r[:3], scan.pose(), T), r[3:]))
