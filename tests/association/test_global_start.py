@@ -14,6 +14,8 @@ from kalmark.association.global_start import (
     Proposal,
     bases,
     by_chance,
+    chance_of_fit,
+    chance_of_rival,
     distinct,
     hypotheses,
     locate_points,
@@ -112,11 +114,28 @@ def test_supporters_are_counted_as_one_by_one_of_the_poses_that_may_be_the_best(
 
 
 def test_matchings_by_chance_are_the_tail_of_a_binomial() -> None:
-    of, v = known(PLACES), np.zeros((7, 2))
+    of = known(PLACES)
     p = of.density() * np.pi * chi2.ppf(REACH, 2) * 2 * 0.3**2
     assert 0 < p < 1
+    assert chance_of_fit(of, np.full(7, 0.3)) == pytest.approx(p)
     for count in (3, 5, 7):
-        assert by_chance(of, v, np.full(7, 0.3), count, 40) == pytest.approx(40 * binom.sf(count - 3, 5, p))
+        assert by_chance(p, 7, count, 40) == pytest.approx(40 * binom.sf(count - 3, 5, p))
+
+
+def test_a_fit_is_as_likely_by_chance_as_the_best_wrong_pose_has_it() -> None:
+    assert by_chance(chance_of_rival(6, 9, 300), 9, 6, 300) == pytest.approx(1.0)
+    assert chance_of_rival(2, 9, 300) == 0.0, "a pair fits by construction"
+
+
+def test_what_fits_in_a_row_is_likely_by_chance() -> None:
+    row = np.column_stack([3.0 * np.arange(12), np.zeros(12)])
+    places = np.vstack([row, [[40.0, 7.0], [44.0, -3.0], [-9.0, 5.0]]])
+    found = search(known(places), places, np.full(len(places), 0.01))
+    assert isinstance(found, GlobalPose)
+    assert found.p > 0.3
+    apart = search(known(PLACES), PLACES, np.full(len(PLACES), 0.01))
+    assert isinstance(apart, GlobalPose)
+    assert apart.p < 0.3
 
 
 def test_a_scan_that_fits_in_one_place_gives_its_pose() -> None:

@@ -67,8 +67,7 @@ def test_what_is_held_back_does_not_pull_the_pose() -> None:
 
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
 def test_a_robot_that_has_lost_its_way_is_found_before_it_maps_a_garden_twice(estimator: object) -> None:
-    slam, reports = carried_off(slam_of(estimator), sigma=3.0, off=2.5)
-    assert [gap.kind for r in reports for gap in r.gaps] == ["elsewhere"]
+    slam, _ = carried_off(slam_of(estimator), sigma=3.0, off=2.5)
     assert len(slam.landmarks()) == len(GARDEN)
     assert np.linalg.norm(slam.mean("cart")) < 0.2
 

@@ -39,8 +39,9 @@ def test_an_older_landmark_that_fits_after_an_onset_counts_against_it() -> None:
 
 def test_what_is_mapped_again_counts_for_onsets_before_it() -> None:
     of = evidence()
-    of.weigh([(60, -3.0)])
-    assert (of.ratio, of.since_ns) == (-10.0, 59)
+    of.again = [(60, -3.0)]
+    of.weigh()
+    assert (of.ratio, of.since_ns) == (-7.0, 59)
 
 
 def test_a_landmark_that_is_missed_when_it_is_begun_decides_nothing() -> None:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import bdtrc
+from scipy.special import bdtrc, betaincinv
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.association.relocalization import SAME_M, SAME_RAD, align_points, is_same_pose, resect
@@ -44,10 +44,15 @@ MOST_PAIRS = 2_000_000  # of landmarks
 
 
 class GlobalPose(NamedTuple):
-    """A pose T (3,) or (7,) and the row of the landmark of each observation (K,), -1 for none."""
+    """A pose T (3,) or (7,) and the row of the landmark of each observation (K,), -1 for none.
+
+    One observation fits a wrong pose with the probability p, as many as here do so at so many poses by `chance`.
+    """
 
     T: Array
     matched: Index
+    p: float = 0.0
+    chance: float = 0.0
 
     @property
     def pairs(self) -> int:
@@ -58,13 +63,15 @@ class GlobalPose(NamedTuple):
 class Proposal(NamedTuple):
     """A pose T of a sensor, (3,) or (7,), its covariance, the landmark of each observation (K,) and the log odds.
 
-    These are against chance; a landmark counts at most `SURE`, what has no ids twice that.
+    These are against chance; a landmark counts at most `SURE`, what has no ids twice that.  An observation without an
+    id is at a landmark from a wrong pose with the probability p.
     """
 
     T: Array
     cov: Array
     matched: Index
     gain: float
+    p: float = 0.0
 
 
 def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:
@@ -78,10 +85,10 @@ def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -
         return found
     matched = np.full(len(v), -1)
     matched[unnamed] = found.matched
-    chance = by_chance(of, v[unnamed], sigma[unnamed], found.pairs, len(of.names) ** 2)
     some = np.flatnonzero(matched >= 0)
     cov = _Points(v, sigma).covariance(found.T, of.places()[matched], some)
-    return Proposal(found.T, cov, matched, -math.log(max(chance, math.exp(-2.0 * SURE))))
+    gain = min(-math.log(max(found.chance, 1e-300)), SURE * (found.pairs - 2))
+    return Proposal(found.T, cov, matched, gain, found.p)
 
 
 def locate_rays(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array, o: Array | None = None) -> Proposal | str:
@@ -267,16 +274,12 @@ def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:
     """Return the pose that places v (K, 2) with these sigmas (K,) determine, or why they do not."""
     if len(v) < FEWEST:
         return f"its scan has {len(v)} observations, a start needs {FEWEST}"
-    poses: list[GlobalPose] = []
-    tried = 0
-    for i, j in bases(v, sigma):
-        T = hypotheses(of, v, sigma, i, j)
-        tried += len(T)
-        poses += supported_poses(of, v, sigma, T, (i, j))
-    poses = distinct(poses)
+    tried = [(base, hypotheses(of, v, sigma, *base)) for base in bases(v, sigma)]
+    poses = distinct([pose for base, T in tried for pose in supported_poses(of, v, sigma, T, base)])
     if not poses:
         return f"no pose in the known map explains most of its {len(v)} observations"
-    chance = by_chance(of, v, sigma, poses[0].pairs, tried)
+    p, number = chance_of_fit(of, sigma), sum(len(T) for _, T in tried)
+    chance = by_chance(p, len(v), poses[0].pairs, number)
     if chance > BY_CHANCE:
         return f"{poses[0].pairs} observations agree, {chance:.1g} poses as good are expected by chance"
     poses = distinct([refine_pose(of, v, sigma, pose) for pose in poses])
@@ -285,7 +288,10 @@ def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:
         return f"at most {best.pairs} of its {len(v)} observations agree with a pose in the known map"
     if len(poses) > 1 and poses[1].pairs > best.pairs - AS_GOOD:
         return f"its scan fits {poses[1].pairs} landmarks from another pose, and {best.pairs} from this one"
-    return best
+    others = [(base, T[~_are_same(T, best.T)]) for base, T in tried]
+    rival = max(int(_supporters(of, v, sigma, T, base, FEWEST)[0].max(initial=0)) for base, T in others)
+    p = max(p, chance_of_rival(rival, len(v), number))
+    return best._replace(p=p, chance=by_chance(p, len(v), best.pairs, number))
 
 
 def bases(v: Array, sigma: Array) -> list[tuple[int, int]]:
@@ -317,16 +323,23 @@ def hypotheses(of: Known, v: Array, sigma: Array, i: int, j: int) -> Array:
 
 def supported_poses(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int]) -> list[GlobalPose]:
     """Return of poses (H, 3) from a base those with which most of the scan agrees, or with `AS_GOOD` more would."""
+    counts, reach = _supporters(of, v, sigma, T, base, max(FEWEST, len(v) // 2 + 1 - AS_GOOD))
+    best = T[(counts > 0) & (counts > counts.max(initial=0) - AS_GOOD)]
+    gaps, rows = of.tree().query(points_at_poses(best, v))
+    return [GlobalPose(*one) for one in zip(best, np.where(gaps <= reach, rows, -1), strict=True)]
+
+
+def _supporters(of: Known, v: Array, sigma: Array, T: Array, base: tuple[int, int], least: int) -> tuple[Index, Array]:
+    """Return how many of v (K, 2) agree with poses T (H, 3) from a base, 0 of poses with less than `least`, and reach.
+
+    That (K,) is how far each may be from its landmark.
+    """
     i, j = base
     turn = np.hypot(sigma[i], sigma[j]) / np.linalg.norm(v[j] - v[i])
     lever = np.linalg.norm(v - (v[i] + v[j]) / 2, axis=1)
     spread = np.sqrt(sigma**2 + (sigma[i] ** 2 + sigma[j] ** 2) / 4 + (turn * lever) ** 2)
     reach, places = math.sqrt(chi2_gate(REACH, 2)) * spread, of.places()
-    least = max(FEWEST, len(v) // 2 + 1 - AS_GOOD)
-    counts = count_supporters(T, v, reach, places[np.argsort(places[:, 0], kind="stable")], least)
-    best = T[(counts > 0) & (counts > counts.max(initial=0) - AS_GOOD)]
-    gaps, rows = of.tree().query(points_at_poses(best, v))
-    return [GlobalPose(*one) for one in zip(best, np.where(gaps <= reach, rows, -1), strict=True)]
+    return count_supporters(T, v, reach, places[np.argsort(places[:, 0], kind="stable")], least), reach
 
 
 @compiled
@@ -363,7 +376,7 @@ def points_at_poses(T: Array, v: Array) -> Array:
 
 def refine_pose(of: Known, v: Array, sigma: Array, pose: GlobalPose) -> GlobalPose:
     """Return a pose by least squares of all its pairs, and the pairs from there, of each landmark one."""
-    T, matched = pose
+    T, matched = pose.T, pose.matched
     for _ in range(2):
         rows = np.flatnonzero(matched >= 0)
         if len(rows) < FEWEST:
@@ -385,14 +398,30 @@ def distinct(poses: list[GlobalPose]) -> list[GlobalPose]:
     out, left = list[GlobalPose](), sorted(poses, key=lambda pose: -pose.pairs)
     while left:
         out.append(left[0])
-        off = np.array([pose.T for pose in left]) - left[0].T
-        same = (np.hypot(off[:, 0], off[:, 1]) <= SAME_M) & (np.abs(wrap(off[:, 2])) <= SAME_RAD)
+        same = _are_same(np.array([pose.T for pose in left]), left[0].T)
         left = [pose for pose, is_one in zip(left, same.tolist(), strict=True) if not is_one]
     return out
 
 
-def by_chance(of: Known, v: Array, sigma: Array, count: int, tried: int) -> float:
-    """Return how many of so many poses, each right for its two pairs, have as many pairs by chance."""
-    area = math.pi * chi2_gate(REACH, 2) * float(np.mean(sigma**2)) * 2.0
-    p = min(1.0, of.density() * area)
-    return tried * float(bdtrc(count - 3, len(v) - 2, p))
+def _are_same(T: Array, one: Array) -> Flags:
+    """Return which poses (H, 3) are one with another."""
+    off = T - one
+    return np.asarray((np.hypot(off[:, 0], off[:, 1]) <= SAME_M) & (np.abs(wrap(off[:, 2])) <= SAME_RAD))
+
+
+def chance_of_fit(of: Known, sigma: Array) -> float:
+    """Return the probability that an observation is at one of landmarks anywhere by chance."""
+    return min(1.0, of.density() * math.pi * chi2_gate(REACH, 2) * float(np.mean(sigma**2)) * 2.0)
+
+
+def chance_of_rival(pairs: int, count: int, tried: int) -> float:
+    """Return the probability of a fit with which one of so many poses is expected to have as many pairs of `count`.
+
+    With those of the best wrong pose it is as large as landmarks agree with themselves elsewhere, as in rows.
+    """
+    return float(betaincinv(pairs - 2, count - pairs + 1, 1.0 / tried)) if pairs > 2 else 0.0
+
+
+def by_chance(p: float, count: int, pairs: int, tried: int) -> float:
+    """Return how many of so many poses, each right for its two pairs, have as many pairs of `count` by chance."""
+    return tried * float(bdtrc(pairs - 3, count - 2, p))

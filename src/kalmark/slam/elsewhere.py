@@ -36,6 +36,7 @@ from kalmark.geometry.pose_frames import FRAMES, moved_with
 from kalmark.geometry.spaces import Space
 from kalmark.management import existence
 from kalmark.management.reparametrize import POINTS
+from kalmark.management.repeated_places import GROWN
 from kalmark.models.protocols import Pointed, UnknownDepth
 from kalmark.report import ELSEWHERE, Gap
 from kalmark.slam.evidence import Evidence
@@ -115,16 +116,12 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
     _note(state, scan, of, look)
     if of.ratio >= 0.0 and all_named:
         del state.evidence[robot]
-    if of.ratio <= -SURE:
-        old, is_look = older(state, scan, of), look is not None or all_named
-        is_tried = of.fitted and robot in state.pose_hypotheses
-        if is_look and not is_tried:
-            _propose(state, scan, of, old)
-        if of.fitted and robot in state.pose_hypotheses and (is_tried or all_named):
-            _try(state, scan, of, old)
-    elif of.fitted:
-        state.pose_hypotheses.pop(robot, None)
-        of.fitted = {}
+    is_tried = robot in state.pose_hypotheses and bool(of.fitted)
+    is_due = of.ratio <= -SURE or scan.tracks.changes - of.searched >= GROWN
+    if is_due and not is_tried and (look is not None or all_named):
+        _propose(state, scan, of)
+    if of.fitted and robot in state.pose_hypotheses and (is_tried or all_named):
+        _try(state, scan, of)
 
 
 def _note(state: State, scan: ScanContext, of: Evidence, look: existence.ObservedAndMissed | None) -> None:
@@ -140,15 +137,18 @@ def _note(state: State, scan: ScanContext, of: Evidence, look: existence.Observe
     of.weigh()
 
 
-def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | None = None) -> Array:
-    """Return the log probability (M,) that observations have a landmark of a density in their gates by chance."""
+def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | None = None, p: float = 0.0) -> Array:
+    """Return the log probability (M,) that observations have a landmark of a density in their gates by chance.
+
+    It is at least p of those without ids.
+    """
     named = np.array([scan.ids[k] is not None for k in rows], dtype=np.bool_)
     if named.all():
         return np.full(len(rows), -SURE)
     V = scan.channel.calibrated(scan.map).invert(scan.y[rows])[1][:, :2]
     C = V @ (scan.report.Z[rows] if Z is None else Z) @ V.swapaxes(1, 2)
     area = math.pi * gate(SURVEYED, 2) * np.sqrt(np.maximum(np.linalg.det(C), 0.0))
-    chance = np.where(named, math.exp(-SURE), np.minimum(density * area, 1.0))
+    chance = np.where(named, math.exp(-SURE), np.minimum(np.maximum(density * area, p), 1.0))
     return np.log(np.maximum(np.where(np.isfinite(chance), chance, 1.0), math.exp(-SURE)))
 
 
@@ -176,6 +176,7 @@ def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[
     v, sigma = scan.places()
     shown = {o.landmark for o in scan.report.observations}
     rows = np.column_stack([of_world.from_frame(T, v)[0], np.tile(T[:d], (len(v), 1)), sigma]).tolist()
+    usual = np.median(sigma)
     of.far |= {
         name: tuple(row)
         for name, row in zip(scan.ids, rows, strict=True)
@@ -183,7 +184,7 @@ def _constellation(state: State, scan: ScanContext, of: Evidence) -> tuple[list[
     }
     more: list[Any] = [(name, row) for name, row in of.far.items() if name not in scan.ids]
     more += [
-        (None, (*state.map.mean(tracks.slots[name])[:d], *T[:d], np.median(sigma)))
+        (None, (*state.map.mean(tracks.slots[name])[:d], *T[:d], usual))
         for name in _young(tracks, scan.event.robot, of)
         if name not in shown and tracks.is_invented(name)
     ]
@@ -208,17 +209,26 @@ def locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposa
     return None if isinstance(found, str) else found
 
 
-def _propose(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
-    """Begin a second hypothesis where a constellation is one of old landmarks."""
-    found, name, r = locate(state, scan, of, old), scan.event.robot, state.map.mean(scan.robot)
-    if found is None:
+def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
+    """Begin a second hypothesis where a constellation is one of old landmarks, and its robot is not there."""
+    name, r, tracks = scan.event.robot, state.map.mean(scan.robot), state.tracks
+    if of.ratio > -SURE:
+        own = [t for t in tracks.confirmed.values() if t.begun[1] == name and tracks.is_invented(t.id)]
+        onset_ns, of.searched = of.onset([state.begun_ns(t.id) for t in own], ODDS), tracks.changes
+        if onset_ns is None:
+            return
+        of.since_ns = onset_ns
+    old = older(state, scan, of)
+    found = locate(state, scan, of, old)
+    if found is None or is_same_pose(found.T, scan.pose()):
         return
     other = state.pose_hypotheses[name] = PoseHypothesis.of(
         state.map, state.moving[name], state.blocks, scan.event.t_ns
     )
-    pose = moved_with(r[: len(found.T)], scan.pose(), found.T)
-    write_robot(other.map, other.moving, pose, found.cov)
+    write_robot(other.map, other.moving, moved_with(r[: len(found.T)], scan.pose(), found.T), found.cov)
     of.gain, of.fitted = found.gain, {old.names[row]: 0.0 for row in found.matched if row >= 0}
+    of.p, of.again = found.p, _mapped_again(state, scan, r, other.map.mean(scan.robot), found.cov)
+    of.weigh()
 
 
 def _pair(scan: ScanContext, places: Array | None, old: Known) -> dict[int, int]:
@@ -233,12 +243,12 @@ def _pair(scan: ScanContext, places: Array | None, old: Known) -> dict[int, int]
     return {int(rows[k]): int(k) for k in np.argsort(-gaps, kind="stable") if rows[k] >= 0}
 
 
-def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
+def _try(state: State, scan: ScanContext, of: Evidence) -> None:
     """Correct a second hypothesis by a scan; place the robot there if it is certain, and forget it if it does not fit.
 
     The constellation has to be one of old landmarks there, and nowhere else, still.
     """
-    robot, channel = scan.event.robot, scan.channel
+    robot, channel, old = scan.event.robot, scan.channel, older(state, scan, of)
     other, model = state.pose_hypotheses[robot], channel.models[old.model.kind]
     view, places = replace(scan, map=other.map), channel.places(other.map, scan.robot, scan.y)
     pairs = _pair(scan, places, old) if len(old.names) else {}
@@ -247,7 +257,7 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         names, rows = [old.names[row] for row in pairs], [*pairs.values()]
         update = view.known_update(model, old.values[[*pairs]], rows)._replace(gate=gate(SURVEYED, channel.dof))
         done = state.estimator.for_fixes().correct(other.map, update._replace(R=LOOSE**2 * update.R))
-        gains = np.where(done.fused, -_log_chance(scan, rows, old.density(), done.Z), -SURE)
+        gains = np.where(done.fused, -_log_chance(scan, rows, old.density(), done.Z, of.p), -SURE)
         fits = [*compress(names, done.fused)]
         each = zip(names, rows, gains.tolist(), done.fused.tolist(), strict=True)
         logs = {name: gain for name, k, gain, is_one in each if is_one or scan.ids[k] is not None}
@@ -255,12 +265,12 @@ def _try(state: State, scan: ScanContext, of: Evidence, old: Known) -> None:
         logs = existence.log_misses(view, old, state.policies[scan.key].upkeep) | logs
     of.count(logs)
     if of.gain - of.ratio >= math.log(ODDS) and fits:
-        pose = channel.pose(other.map, scan.robot)
-        if None not in scan.ids or ((again := locate(state, scan, of, old)) and is_same_pose(again.T, pose)):
+        again = locate(state, scan, of, old) if None in scan.ids else None
+        if None not in scan.ids or (again and {old.names[row] for row in again.matched if row >= 0} <= {*of.fitted}):
             _place(state, scan, of, other, fits)
     elif of.gain <= -SURE:
         del state.pose_hypotheses[robot]
-        of.fitted, of.gain = {}, 0.0
+        of.fitted, of.gain, of.again = {}, 0.0, []
 
 
 def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis, fits: Sequence[Id]) -> None:
@@ -285,7 +295,8 @@ def _place(state: State, scan: ScanContext, of: Evidence, other: PoseHypothesis,
     F, Q = np.eye(n), np.zeros((n, n))
     F[: len(cov)], Q[: len(cov), : len(cov)] = 0.0, cov
     F[:dof, len(cov) :] = of_map
-    of.weigh(_mapped_again(state, scan, before, after, cov))
+    of.again = _mapped_again(state, scan, before, after, cov)
+    of.weigh()
     moved = [*own, *(tracks.slots[name] for name in mapped)]
     state.move_blocks(moved, F, Q, map(other.map.mean, own))
     for name in _young(tracks, robot, of):

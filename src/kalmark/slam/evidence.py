@@ -13,17 +13,21 @@ Once it is known where the robot is instead, those begun since s that are older 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
 import numpy as np
 
+from kalmark.arrays import Array, Flags, Index
 from kalmark.association.global_start import SURE
 from kalmark.events import Id
 
 MOST, RECENT = 64, 256  # landmarks whose misses count most, and that were seen last, which outweigh all others
+FEWEST = 5  # landmarks of a constellation that was mapped where nothing shows that the robot is elsewhere
 NEVER_NS = -(2**62)  # when landmarks begin that were surveyed
+NOTHING = NEVER_NS, NEVER_NS, 0.0
 EQUAL = 1e-9  # between two ratios that are one but for rounding
 
 
@@ -34,6 +38,8 @@ class Evidence:
     Of these it is when they were seen last, since when they are missed, and the log.  `ratio` is the least one, of an
     onset at `since_ns`, `gain` that of the robot's second hypothesis, in which the landmarks `fitted` have counted with
     these logs, those of the constellation together.
+    Those begun `again` are older ones in that hypothesis, with when they were begun and the log; p is the probability
+    of a fit by chance.  `searched` is how much the map had changed when a constellation was looked for.
     `far` are the places (x, y), in space with z, of observations with ids elsewhere and of their sensor, as the filter
     has them, with a sigma.
     """
@@ -45,6 +51,9 @@ class Evidence:
     far: dict[Id, tuple[float, ...]] = field(default_factory=dict)
     gain: float = 0.0
     fitted: dict[Id, float] = field(default_factory=dict)
+    again: list[tuple[int, float]] = field(default_factory=list)
+    p: float = 0.0
+    searched: int = 0
 
     def see(self, names: Iterable[Id], logs: Iterable[float], t_ns: int, begun_ns: Callable[[Id], int]) -> None:
         """Take note of landmarks that were seen where they are expected."""
@@ -61,26 +70,48 @@ class Evidence:
         most = sorted(reversed(self.missed), key=lambda name: self.missed[name][2])[:MOST]
         self.missed = {name: since for name, since in self.missed.items() if name in most}
 
-    def weigh(self, again: Sequence[tuple[int, float]] = ()) -> None:
-        """Find the onset of the least ratio, the last one of several.
+    def weigh(self) -> None:
+        """Find the onset of the least ratio, the last one of several, those begun `again` included.
 
-        Each landmark counts for the onsets s of an interval: a missed one from when it was seen last until it is
-        missed, a seen one from when it was begun until it was seen.  Those begun `again` at these times, with their
-        logs, count until then: they are older ones if the robot was elsewhere when they were begun.
+        These are older ones if the robot was elsewhere when they were begun; they are no evidence of where it is not.
         """
-        if all(last >= first for last, first, _ in self.missed.values()):
+        onsets, ratios, missed, again = self._of_onsets()
+        some = missed + again < -EQUAL
+        if not some.any():
             self.ratio = 0.0
             return
+        least = (ratios + again)[some].min()
+        last = np.flatnonzero(some & (ratios + again <= least + EQUAL))[-1]
+        self.ratio, self.since_ns = float(ratios[last]), int(onsets[last])
+
+    def onset(self, begun: Sequence[int], odds: float) -> int | None:
+        """Return the onset of the least ratio, the last one of several, that landmarks `begun` since then may outweigh.
+
+        They do so by odds if they are older ones, and enough for a constellation.
+        """
+        onsets, ratios, *_ = self._of_onsets()
+        young = len(begun) - np.searchsorted(np.sort(begun), onsets, side="right")
+        some = np.flatnonzero((young >= FEWEST) & (ratios - SURE * young <= -math.log(odds)))
+        return int(onsets[some[ratios[some] <= ratios[some].min() + EQUAL][-1]]) if len(some) else None
+
+    def _of_onsets(self) -> tuple[Index, Array, Array, Array]:
+        """Return onsets (S,), the ratio of each, the part of it of landmarks missed, and what those begun `again` add.
+
+        Each landmark counts for the onsets of an interval: a missed one from when it was seen last until it is missed,
+        a seen one from when it was begun until it was seen, those begun `again` at these times, with their logs, until
+        then.
+        """
         recent = islice(reversed(self.seen.values()), RECENT)
-        terms = [*self.missed.values(), *recent, *((NEVER_NS, begun, log) for begun, log in again)]
+        terms = [*self.missed.values(), *recent, NOTHING, *((NEVER_NS, begun, log) for begun, log in self.again)]
         begin, end, logs = (np.array(column) for column in zip(*terms, strict=True))
-        is_missed = np.arange(len(logs)) < len(self.missed)
+        row = np.arange(len(terms))
+        is_missed, is_again = row < len(self.missed), row >= len(terms) - len(self.again)
         times, at = np.unique(np.concatenate([begin, end]), return_inverse=True)
-        ratios = np.cumsum(np.bincount(at, np.concatenate([logs, -logs])))
-        some = np.cumsum(np.bincount(at, np.concatenate([is_missed, -1.0 * is_missed]))) > 0.5
-        least = ratios[some].min()
-        last = np.flatnonzero(some & (ratios <= least + EQUAL))[-1]
-        self.ratio, self.since_ns = float(least), int(times[last + 1] - 1)
+
+        def of(some: Flags) -> Array:
+            return np.cumsum(np.bincount(at, np.concatenate([logs * some, -logs * some])))
+
+        return times[1:] - 1, of(~is_again)[:-1], of(is_missed)[:-1], of(is_again)[:-1]
 
     def count(self, logs: Mapping[Id, float]) -> None:
         """Count landmarks for the second hypothesis, each once: one that was missed at first, when it is seen."""

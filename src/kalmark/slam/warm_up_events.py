@@ -11,6 +11,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.association import ByIdentity
+from kalmark.association.global_start import search
 from kalmark.events import Control, Event, Fix, Id, Scan
 from kalmark.filter import kernels
 from kalmark.filter.compressed.compressed_map import CompressedMap
@@ -21,6 +22,7 @@ from kalmark.geometry import frames, frames3d
 from kalmark.geometry.spaces import VECTOR, VECTOR3
 from kalmark.management.repeated_places import find_repeats
 from kalmark.models.landmark_views import Spatial
+from kalmark.models.landmarks import Point2D
 from kalmark.models.model_check import views
 from kalmark.models.protocols import (
     TWIST,
@@ -34,6 +36,7 @@ from kalmark.models.protocols import (
 from kalmark.slam.estimate import Estimate
 from kalmark.slam.merging import make_equal
 from kalmark.slam.robot import IDENTITY, Mount, Robot
+from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.track import ChannelKey, Track, Tracks
 
 ROUNDS = 12  # of a control and scans: enough for whatever waits for several
@@ -147,7 +150,8 @@ def _scan(twin: Estimate, key: ChannelKey, y: Array, ids: list[Id] | None) -> Sc
 
 
 def _merge(twin: Estimate) -> None:
-    """Make two landmarks equal, as where observations have no ids: through a model in Python; search for repeats."""
+    """Make two landmarks equal, as where observations have no ids: through a model in Python; search for places."""
+    _search_a_pose()
     for (robot, sensor), policy in twin.state.policies.items():
         channel = twin.state.channels[robot, sensor]
         if policy.upkeep.repeats != "off":
@@ -168,6 +172,14 @@ def _search_repeats(landmark: Landmark) -> None:
             slot = map_.add(landmark.space, place, 1e-4 * np.eye(2))
             tracks.confirm(Track(name, landmark, slot, covisible={*names}))
     find_repeats(map_, tracks)
+
+
+def _search_a_pose() -> None:
+    """Search the pose from which landmarks of the plane are seen."""
+    known, places = Known(Point2D()), np.random.default_rng(0).uniform(0.0, 9.0, (9, 2))
+    for k, place in enumerate(places):
+        known.add(k, place)
+    search(known, places, np.full(len(places), 0.01))
 
 
 def made_up_events(robots: Iterable[Robot], pose: Callable[[str, str], Array]) -> Iterator[Event]:
