@@ -164,11 +164,10 @@ class Repeat(NamedTuple):
 
     `middle` (2,) [m] is that of the newer ones, `shift` (2,) [m] what they are off by there.  `score` is the
     log-likelihood ratio of all pairs against chance, `p` how many such repeats are expected by chance in this map.
-    `agrees`: the map's own covariance lets them be one.  `sure`: accepted by shape alone.  `newer` are all
-    landmarks of the newer part.
+    `agrees`: the map's own covariance lets them be one.  `sure`: accepted by shape alone.
 
     >>> pairs = [(1, 21), (2, 22), (3, 23)]
-    >>> found = Repeat(pairs, np.zeros(3), np.zeros(2), np.array([2.5, 0.5]), 40.0, 1e-9, True, True, [21, 22, 23])
+    >>> found = Repeat(pairs, np.zeros(3), np.zeros(2), np.array([2.5, 0.5]), 40.0, 1e-9, True, True)
     >>> found.pairs[0], found.p < 1e-6, found.sure
     ((1, 21), True, True)
     """
@@ -181,7 +180,6 @@ class Repeat(NamedTuple):
     p: float
     agrees: bool
     sure: bool
-    newer: list[Id]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ from kalmark.association.global_start import (
     bases,
     by_chance,
     chance_of_fit,
-    chance_of_rival,
     distinct,
     hypotheses,
     locate_points,
@@ -117,14 +116,14 @@ def test_matchings_by_chance_are_the_tail_of_a_binomial() -> None:
     of = known(PLACES)
     p = of.density() * np.pi * chi2.ppf(REACH, 2) * 2 * 0.3**2
     assert 0 < p < 1
-    assert chance_of_fit(of, np.full(7, 0.3)) == pytest.approx(p)
+    assert chance_of_fit(of, np.full(7, 0.3), 2, 7, 40) == pytest.approx(p), "a pair fits by construction"
     for count in (3, 5, 7):
         assert by_chance(p, 7, count, 40) == pytest.approx(40 * binom.sf(count - 3, 5, p))
 
 
 def test_a_fit_is_as_likely_by_chance_as_the_best_wrong_pose_has_it() -> None:
-    assert by_chance(chance_of_rival(6, 9, 300), 9, 6, 300) == pytest.approx(1.0)
-    assert chance_of_rival(2, 9, 300) == 0.0, "a pair fits by construction"
+    p = chance_of_fit(known(PLACES), np.full(9, 0.01), 6, 9, 300)
+    assert by_chance(p, 9, 6, 300) == pytest.approx(1.0)
 
 
 def test_what_fits_in_a_row_is_likely_by_chance() -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hall import hall, mapped, right, slam_of
-from repeats import SIGMA_M, WORLDS, World, empty, part
+from repeats import WORLDS, World, empty, part
 
 import kalmark as km
 from kalmark.geometry.frames import from_frame
-from kalmark.management.repeated_places import FALSE_ALARMS, displacement, find_repeats
+from kalmark.management.repeated_places import FALSE_ALARMS, find_repeats
 from kalmark.results.run import Run
 
 
@@ -119,16 +119,14 @@ def test_a_hall_mapped_once_has_no_repeats() -> None:
     assert mapped(hall(2)).evaluate()["repeats"] == []
 
 
-@pytest.mark.usefixtures("never_found")
-def test_a_hall_mapped_twice_becomes_one_where_repeats_are_merged() -> None:
+def test_a_robot_that_maps_a_hall_again_is_placed_by_its_shape_where_no_two_places_are_alike() -> None:
     log = hall(5, gap_s=4.0)
     run = mapped(log, gaps="ignore", repeats="merge")
     summary = run.evaluate()
     assert right(run, log)
     assert summary["repeats"] == []
     assert summary["nis_per_dof"] < 1.1
-    (note,) = [line for line in summary["notes"] if "merged at" in line]
-    assert "landmarks mapped twice, in a map that repeated itself: merged at t=" in note
+    assert "elsewhere" in [gap["kind"] for gap in summary["gaps"]]
 
 
 @pytest.mark.parametrize("estimator", [km.estimators.Ekf(), km.estimators.Fej()], ids=["ekf", "fej"])
@@ -140,55 +138,24 @@ def test_a_repeat_is_merged_in_every_map_by_every_estimator(estimator: km.estima
 
 
 @pytest.mark.usefixtures("never_found")
-def test_a_report_has_the_repeats_that_are_not_merged_and_a_saved_map_resumes_bit_for_bit(tmp_path: Path) -> None:
-    log, slams = hall(0, gap_s=4.0), []
-    for repeats_ in ("warn", "merge"):
-        slam = slam_of(log, gaps="ignore", upkeep=km.Upkeep(repeats=repeats_))
-        told = [repeat for event in log.events for repeat in slam.process(event).repeats]
-        assert any(repeat.sure for repeat in told) is (repeats_ == "warn")
-        assert len(slam.landmarks()) == (48 if repeats_ == "warn" else 24)
-    half = len(log.events) // 2
+def test_a_report_has_the_repeats_that_are_not_merged() -> None:
+    log = hall(0, gap_s=4.0)
+    slam = slam_of(log, gaps="ignore", upkeep=km.Upkeep(repeats="warn"))
+    told = [repeat for event in log.events for repeat in slam.process(event).repeats]
+    assert any(repeat.sure for repeat in told)
+    assert len(slam.landmarks()) == 48
+
+
+def test_a_filter_that_places_a_robot_by_a_shape_resumes_bit_for_bit(tmp_path: Path) -> None:
+    log = hall(0, gap_s=4.0)
+    few = len(log.events) // 4
     slams = [slam_of(log, gaps="ignore", upkeep=km.Upkeep(repeats="merge"))]
-    for event in log.events[:half]:
+    for event in log.events[:few]:
         slams[0].process(event)
     slams[0].save(tmp_path / "map.kmk")
     slams.append(km.Slam.load(tmp_path / "map.kmk"))
-    told = [[slam.process(event).merged for event in log.events[half:]] for slam in slams]
+    told = [[slam.process(event).gaps for event in log.events[few:]] for slam in slams]
     assert told[0] == told[1]
-    assert any(told[0])
+    assert "elsewhere" in [gap.kind for gaps in told[0] for gap in gaps]
+    assert len(slams[0].landmarks()) == 24
     np.testing.assert_array_equal(slams[0].covariance("rover"), slams[1].covariance("rover"))
-
-
-def test_the_newer_part_begins_where_the_robot_lost_its_way_also_where_an_older_landmark_was_taken_for_one() -> None:
-    rng, slam, T = np.random.default_rng(1), empty(), np.array([60.0, 3.0, 2.4])
-    places = rng.uniform(0, 30, (60, 2))
-    older, moved, by_x = part(slam, places, rng), from_frame(T, places)[0], np.argsort(places[:, 0])
-    alone, others = by_x[:8], by_x[12:]  # seen with none of the others
-    newer = part(slam, moved[alone], rng) + part(slam, moved[others], rng)
-    slam.tracks.note_scan([older[int(by_x[30])], *newer[:3]])
-    (repeat,) = find_repeats(slam.map, slam.tracks)
-    assert sorted(repeat.newer) == sorted(newer)
-    wanted = {(older[i], name) for i, name in zip([*alone, *others], newer, strict=True)}
-    assert {*repeat.pairs} <= wanted
-    assert len({*repeat.pairs} & {*list(zip([older[i] for i in alone], newer, strict=False))}) >= 6
-
-
-def test_a_displaced_part_is_as_uncertain_as_it_was_off_and_keeps_its_shape() -> None:
-    rng, slam, T = np.random.default_rng(1), empty(), np.array([5.0, 3.0, 0.4])
-    places = rng.uniform(0, 30, (60, 2))
-    older, newer = part(slam, places, rng), part(slam, from_frame(T, places)[0], rng)
-    (repeat,) = find_repeats(slam.map, slam.tracks)
-    assert sorted(repeat.newer) == sorted(newer)
-    slots = [slam.slot(name) for name in newer]
-    means, F, Q = displacement(slam.map, slots, repeat)
-    back = np.array([slam.mean(name) for name in older])
-    np.testing.assert_allclose(np.array(means), back, atol=0.3)
-    P = F @ slam.covariance(*newer) @ F.T + Q
-    middle = int(np.argmin(np.linalg.norm(np.array(means) - places.mean(axis=0), axis=1)))
-    sigma = np.sqrt(P[2 * middle, 2 * middle])
-    assert sigma == pytest.approx(np.linalg.norm(repeat.shift), rel=0.2)
-    a, b = 0, 1
-    apart = np.array(means)[a] - np.array(means)[b]
-    J = np.hstack([apart, -apart]) / np.linalg.norm(apart)
-    both = np.r_[2 * a : 2 * a + 2, 2 * b : 2 * b + 2]
-    assert J @ P[np.ix_(both, both)] @ J == pytest.approx(2 * SIGMA_M**2), "a rigid motion changes no distance"

@@ -189,7 +189,10 @@ def test_trees_that_were_felled_do_not_carry_a_robot() -> None:
 
 @pytest.mark.parametrize("repeats", ["off", "merge"])
 def test_the_onset_is_found_although_the_way_led_through_an_empty_place_first(repeats: str) -> None:
-    """A car spins by 2 rad and maps cones where there are none: it is placed by the shape of what it maps again."""
+    """A car spins by 2 rad and maps cones again where there are none, and only then misses those that are there.
+
+    Where no two places are alike it is placed before, by the shape of what it maps again.
+    """
     log = simulate(load_world("race_track"), 0)
     slam, carried = (
         build_slam(load_world("race_track", [f"filter.upkeep.repeats={repeats}"]).config(), log),
@@ -203,7 +206,7 @@ def test_the_onset_is_found_although_the_way_led_through_an_empty_place_first(re
             carried += slam.process(event).gaps
     assert [gap.kind for gap in carried] == ["elsewhere"]
     assert 54.0 < carried[0].start_ns * 1e-9 < 60.0
-    assert carried[0].end_ns * 1e-9 < 62.0
+    assert carried[0].end_ns * 1e-9 < (62.0 if repeats == "merge" else 90.0)
     assert len(slam.landmarks()) <= len(log.landmarks) + 1
 
 

@@ -278,7 +278,8 @@ def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:
     poses = distinct([pose for base, T in tried for pose in supported_poses(of, v, sigma, T, base)])
     if not poses:
         return f"no pose in the known map explains most of its {len(v)} observations"
-    p, number = chance_of_fit(of, sigma), sum(len(T) for _, T in tried)
+    number = sum(len(T) for _, T in tried)
+    p = chance_of_fit(of, sigma, 0, len(v), number)
     chance = by_chance(p, len(v), poses[0].pairs, number)
     if chance > BY_CHANCE:
         return f"{poses[0].pairs} observations agree, {chance:.1g} poses as good are expected by chance"
@@ -290,7 +291,7 @@ def search(of: Known, v: Array, sigma: Array) -> GlobalPose | str:
         return f"its scan fits {poses[1].pairs} landmarks from another pose, and {best.pairs} from this one"
     others = [(base, T[~_are_same(T, best.T)]) for base, T in tried]
     rival = max(int(_supporters(of, v, sigma, T, base, FEWEST)[0].max(initial=0)) for base, T in others)
-    p = max(p, chance_of_rival(rival, len(v), number))
+    p = chance_of_fit(of, sigma, rival, len(v), number)
     return best._replace(p=p, chance=by_chance(p, len(v), best.pairs, number))
 
 
@@ -409,17 +410,14 @@ def _are_same(T: Array, one: Array) -> Flags:
     return np.asarray((np.hypot(off[:, 0], off[:, 1]) <= SAME_M) & (np.abs(wrap(off[:, 2])) <= SAME_RAD))
 
 
-def chance_of_fit(of: Known, sigma: Array) -> float:
-    """Return the probability that an observation is at one of landmarks anywhere by chance."""
-    return min(1.0, of.density() * math.pi * chi2_gate(REACH, 2) * float(np.mean(sigma**2)) * 2.0)
+def chance_of_fit(of: Known, sigma: Array, pairs: int, count: int, tried: int) -> float:
+    """Return the probability that an observation is at a landmark from a wrong pose.
 
-
-def chance_of_rival(pairs: int, count: int, tried: int) -> float:
-    """Return the probability of a fit with which one of so many poses is expected to have as many pairs of `count`.
-
-    With those of the best wrong pose it is as large as landmarks agree with themselves elsewhere, as in rows.
+    It is that of landmarks anywhere, or, if it is larger, that with which one of so many poses is expected to have as
+    many pairs of `count` as the best wrong one: landmarks in rows agree with themselves elsewhere.
     """
-    return float(betaincinv(pairs - 2, count - pairs + 1, 1.0 / tried)) if pairs > 2 else 0.0
+    p = min(1.0, of.density() * math.pi * chi2_gate(REACH, 2) * float(np.mean(sigma**2)) * 2.0)
+    return max(p, float(betaincinv(pairs - 2, count - pairs + 1, 1.0 / tried))) if pairs > 2 else p
 
 
 def by_chance(p: float, count: int, pairs: int, tried: int) -> float:

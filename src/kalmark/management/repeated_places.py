@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags, Index, block_diagonal
+from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id
 from kalmark.filter.map import Map
-from kalmark.geometry.angles import rotation
 from kalmark.geometry.gaussian import gate as chi2_gate
 from kalmark.geometry.spaces import SCALAR, VECTOR
 from kalmark.management.constellations import (
@@ -35,8 +34,6 @@ from kalmark.management.constellations import (
     extended,
     fit,
     hull,
-    matched,
-    sides,
 )
 from kalmark.management.merge import EQUAL_M, GATE, SLACK
 from kalmark.report import Repeat
@@ -53,9 +50,7 @@ WEIGHED = 40  # pairs that are weighed together
 SURE = 1e-9  # expected of a map without repeats, below which a repeat is accepted
 FITS = 0.9999  # of right shapes pass
 GROWN = 5  # landmarks that have come or gone until a map is searched again
-TURNED_RAD = 0.1  # a sigma of the turn that is allowed for at least
 IN_A_REPEAT = "in a repeat"  # ends the reason of a merge
-CLEAR = 0.2  # from a half, the share of the last scan's landmarks that decides in which part a robot is
 MISSED = math.log(0.1)  # log ratio of a landmark without a partner where one should be
 
 
@@ -238,36 +233,10 @@ def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constell
     # as likely by chance: the ratio exceeds 1 over it as seldom; one that the covariance excludes is less likely yet
     if score <= -math.log(FALSE_ALARMS if agrees else SURE):
         return None
-    sure, young = bool(p <= SURE and fits and not rivals), _newer(of, T, pairs)
-    if sure:  # then two of a pair that were seen in one scan were so by a wrong association
-        pairs = matched(of, T, pairs, ~young, young)
-        pairs = pairs[~of.given[pairs].all(axis=1)]
     named = [(look.names[a], look.names[b]) for a, b in pairs.tolist()]
-    named_newer = [look.names[i] for i in np.flatnonzero(young).tolist()]
     older, middle, b = (np.array([z.real, z.imag]) for z in (*of.z[pairs].mean(axis=0), T[1]))
-    return Repeat(named, np.append(b, np.angle(T[0])), middle, middle - older, score, p, agrees, sure, named_newer)
-
-
-def _newer(of: Places, T: Transform, pairs: Index) -> Flags:
-    """Return which landmarks (N,) are of the newer part: begun since its onset, and seen with no more of the older one.
-
-    The onset is where most of those that T moves onto younger ones have one on either side, others were taken for
-    another; of such times that which parts fewest landmarks that were seen together.
-    """
-    n, every = len(of.z), np.ones(len(of.z), dtype=np.bool_)
-    pairs = matched(of, T, pairs, every, every)
-    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
-    together = np.column_stack([np.repeat(np.arange(n), np.diff(of.first)), of.seen])
-    onset = int(np.lexsort((_parted(together, n), -_parted(pairs, n)))[0])
-    votes = sides(of, pairs[(pairs[:, 0] < onset) & (onset <= pairs[:, 1])])
-    return np.asarray((votes <= 0) & (np.arange(n) >= onset))
-
-
-def _parted(pairs: Index, n: int) -> Index:
-    """Return of each time (n,), that before a landmark, how many pairs (K, 2) in the order of their age it parts."""
-    ends = (np.bincount(column, minlength=n) for column in np.sort(pairs, axis=1).T)
-    begun, ended = (np.concatenate([[0], np.cumsum(each)[:-1]]) for each in ends)
-    return np.asarray(begun - ended)
+    sure = bool(p <= SURE and fits and not rivals)
+    return Repeat(named, np.append(b, np.angle(T[0])), middle, middle - older, score, p, agrees, sure)
 
 
 def _self_similarity(of: Places, part: Index) -> float:
@@ -310,37 +279,3 @@ def _weighed(look: _RepeatCandidates, T: Transform, pairs: Index, density: float
 def is_due(tracks: Tracks) -> bool:
     """Return whether so many landmarks have come or gone that a map should be searched again."""
     return tracks.changes - tracks.searched >= GROWN
-
-
-def is_in(part: list[Id], tracks: Tracks) -> bool | None:
-    """Return whether the landmarks of the last scan are of a part of the map; None if only some are."""
-    newer = {*part}
-    inside = [name in newer for name in tracks.last_scan if name in tracks.confirmed]
-    share = sum(inside) / max(len(inside), 1)
-    return None if not inside or abs(share - 0.5) < CLEAR else share > 0.5
-
-
-def displacement(map_: Map, slots: list[int], repeat: Repeat) -> tuple[list[Array], Array, Array]:
-    """Return the means to which blocks of the newer part of a repeat move, and F and Q of their rows: F P F' + Q.
-
-    They move onto the older part, of an error unknown until now.
-
-    The shift and the turn of the whole part, about the middle of its pairs, have sigmas as large as they are: a robot
-    that lost its way by so much might have lost it so.
-    """
-    R, turn = rotation(-repeat.T[2]), -float(repeat.T[2])
-    t = -R @ repeat.T[:2]
-    middle = R @ repeat.middle + t
-    means, F, G = [], [], []
-    for slot in slots:
-        space = map_.spaces[slot]
-        assert space is not None  # its place comes first
-        moved, F_x = space.rotated(map_.mean(slot), turn), np.eye(space.dof)
-        moved[:2] += t
-        F_x[:2, :2] = R
-        means.append(moved)
-        F.append(F_x)
-        off = np.append(moved[:2] - middle, moved[2:])
-        G.append(np.hstack([np.eye(space.dof, 2), space.generator(off)]))
-    far, all_ = float(repeat.shift @ repeat.shift), np.concatenate(G)
-    return means, block_diagonal(F), all_ @ np.diag([far, far, max(abs(turn), TURNED_RAD) ** 2]) @ all_.T

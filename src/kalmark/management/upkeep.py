@@ -22,7 +22,9 @@ class Upkeep:
     is lost.
 
     With `repeats` two parts of the map that agree under a shift and a turn, though never observed together, are
-    searched while it grows (`repeats.py`): "warn" puts them into the report, "merge" merges those that are accepted.
+    searched while it grows (`repeated_places.py`): "warn" puts them into the report.  "merge" states that no two places
+    have the same shape: those that the covariance of the map lets be one are merged, and a robot that maps a place
+    again is placed by its shape, though no landmark is missed (`elsewhere.py`).
 
     A landmark without an id that should be seen and is not is marked, with `gone` "remove" removed, when it is `odds`
     times likelier that nothing is there (`existence.py`).  The detection probability of the sensor
@@ -45,7 +47,8 @@ class Upkeep:
     merge: Annotated[bool, "Merge landmarks that turn out to be one."] = True
     repeats: Annotated[
         Literal["off", "warn", "merge"],
-        "Search the map for parts that agree under a shift and a turn while it grows: report or merge them.",
+        "Search the map for parts that agree under a shift and a turn while it grows: report them, or, as no two places are "
+        "alike, merge them and place a robot by what it maps again.",
     ] = "off"
     hold_back: Annotated[
         bool,

@@ -116,12 +116,17 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
     _note(state, scan, of, look)
     if of.ratio >= 0.0 and all_named:
         del state.evidence[robot]
-    is_tried = robot in state.pose_hypotheses and bool(of.fitted)
-    is_due = of.ratio <= -SURE or scan.tracks.changes - of.searched >= GROWN
-    if is_due and not is_tried and (look is not None or all_named):
-        _propose(state, scan, of)
-    if of.fitted and robot in state.pose_hypotheses and (is_tried or all_named):
-        _try(state, scan, of)
+    is_unique = state.policies[scan.key].upkeep.repeats == "merge"  # then no two places are alike
+    if of.ratio <= -SURE or is_unique:
+        is_tried = robot in state.pose_hypotheses and bool(of.fitted)
+        is_due = of.ratio <= -SURE or scan.tracks.changes - of.searched >= GROWN
+        if is_due and not is_tried and (look is not None or all_named):
+            _propose(state, scan, of)
+        if of.fitted and robot in state.pose_hypotheses and (is_tried or all_named):
+            _try(state, scan, of)
+    elif of.fitted:
+        state.pose_hypotheses.pop(robot, None)
+        of.fitted, of.again = {}, []
 
 
 def _note(state: State, scan: ScanContext, of: Evidence, look: existence.ObservedAndMissed | None) -> None:

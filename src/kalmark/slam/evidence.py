@@ -20,7 +20,7 @@ from itertools import islice
 
 import numpy as np
 
-from kalmark.arrays import Array, Flags, Index
+from kalmark.arrays import Array, Index
 from kalmark.association.global_start import SURE
 from kalmark.events import Id
 
@@ -75,11 +75,14 @@ class Evidence:
 
         These are older ones if the robot was elsewhere when they were begun; they are no evidence of where it is not.
         """
-        onsets, ratios, missed, again = self._of_onsets()
+        self.ratio = 0.0
+        if not (self.missed or self.again):
+            return
+        onsets, missed, seen, again = self._of_onsets()
         some = missed + again < -EQUAL
         if not some.any():
-            self.ratio = 0.0
             return
+        ratios = missed + seen
         least = (ratios + again)[some].min()
         last = np.flatnonzero(some & (ratios + again <= least + EQUAL))[-1]
         self.ratio, self.since_ns = float(ratios[last]), int(onsets[last])
@@ -89,29 +92,25 @@ class Evidence:
 
         They do so by odds if they are older ones, and enough for a constellation.
         """
-        onsets, ratios, *_ = self._of_onsets()
-        young = len(begun) - np.searchsorted(np.sort(begun), onsets, side="right")
+        onsets, missed, seen, _ = self._of_onsets()
+        young, ratios = len(begun) - np.searchsorted(np.sort(begun), onsets, side="right"), missed + seen
         some = np.flatnonzero((young >= FEWEST) & (ratios - SURE * young <= -math.log(odds)))
         return int(onsets[some[ratios[some] <= ratios[some].min() + EQUAL][-1]]) if len(some) else None
 
     def _of_onsets(self) -> tuple[Index, Array, Array, Array]:
-        """Return onsets (S,), the ratio of each, the part of it of landmarks missed, and what those begun `again` add.
+        """Return onsets (S,), and the sums (S,) of the logs of landmarks missed, seen, and begun `again`.
 
         Each landmark counts for the onsets of an interval: a missed one from when it was seen last until it is missed,
-        a seen one from when it was begun until it was seen, those begun `again` at these times, with their logs, until
-        then.
+        a seen one from when it was begun until it was seen, those begun `again` at these times until then.
         """
-        recent = islice(reversed(self.seen.values()), RECENT)
-        terms = [*self.missed.values(), *recent, NOTHING, *((NEVER_NS, begun, log) for begun, log in self.again)]
+        recent = [*islice(reversed(self.seen.values()), RECENT), NOTHING]
+        terms = [*self.missed.values(), *recent, *((NEVER_NS, begun, log) for begun, log in self.again)]
         begin, end, logs = (np.array(column) for column in zip(*terms, strict=True))
-        row = np.arange(len(terms))
-        is_missed, is_again = row < len(self.missed), row >= len(terms) - len(self.again)
         times, at = np.unique(np.concatenate([begin, end]), return_inverse=True)
-
-        def of(some: Flags) -> Array:
-            return np.cumsum(np.bincount(at, np.concatenate([logs * some, -logs * some])))
-
-        return times[1:] - 1, of(~is_again)[:-1], of(is_missed)[:-1], of(is_again)[:-1]
+        which = np.repeat([0, 1, 2], [len(self.missed), len(recent), len(self.again)])
+        changes = np.zeros((3, len(times)))
+        np.add.at(changes, (np.tile(which, 2), at), np.concatenate([logs, -logs]))
+        return times[1:] - 1, *np.cumsum(changes, axis=1)[:, :-1]
 
     def count(self, logs: Mapping[Id, float]) -> None:
         """Count landmarks for the second hypothesis, each once: one that was missed at first, when it is seen."""

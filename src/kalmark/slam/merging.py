@@ -15,7 +15,6 @@ from kalmark.management import merge, wall_growth
 from kalmark.management import repeated_places as of_map
 from kalmark.models.protocols import Joining
 from kalmark.report import Repeat
-from kalmark.slam import elsewhere
 from kalmark.slam.factors import update_by_blocks
 from kalmark.slam.policy import Policy
 from kalmark.slam.state import State
@@ -106,31 +105,9 @@ def search_repeats(state: State, scan: ScanContext, policy: Policy) -> None:
     with suppress(np.linalg.LinAlgError):
         found = of_map.find_repeats(state.map, state.tracks, since)
     for repeat in found:
-        if policy.upkeep.repeats == "merge" and repeat.sure and (repeat.agrees or _displace(state, scan, repeat)):
+        if policy.upkeep.repeats == "merge" and repeat.sure and repeat.agrees:
             merged = _merge_pairs(state, scan, merge.Merge(repeat.pairs, repeat.score))
             scan.report.merged += tuple((gone, kept, f"{why}, {of_map.IN_A_REPEAT}") for gone, kept, why in merged)
             found = [other for other in found if other is not repeat]
             break
     scan.report.repeats = tuple(found)
-
-
-def _displace(state: State, scan: ScanContext, repeat: Repeat) -> bool:
-    """Move the newer part of a repeat, of an error that is unknown until now, onto the older one.
-
-    It has the robot and all that it has not finished if it is there: the robot was elsewhere since that part began.
-    Not with several robots, nor where blocks of the map may belong to either part.
-    """
-    inside = of_map.is_in(repeat.newer, state.tracks)
-    if len(state.robots) > 1 or inside is None or state.tracks.pending:
-        return False
-    slots = [state.tracks.slot(name) for name in repeat.newer]
-    if inside:
-        slots += [scan.robot, *(track.slot for track in state.tracks.tentative.values())]
-        slots += [clone.slot for clone in state.clones.clones.values()]
-    means, F, Q = of_map.displacement(state.map, slots, repeat)
-    before, of = state.map.mean(scan.robot), state.evidence.get(scan.event.robot)
-    state.move_blocks(slots, F, Q, means)
-    if inside and of is not None:
-        since_ns = min(state.begun_ns(name) for name in repeat.newer)
-        elsewhere.report_found(state, scan, since_ns, before)
-    return True

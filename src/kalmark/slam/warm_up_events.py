@@ -151,34 +151,28 @@ def _scan(twin: Estimate, key: ChannelKey, y: Array, ids: list[Id] | None) -> Sc
 
 def _merge(twin: Estimate) -> None:
     """Make two landmarks equal, as where observations have no ids: through a model in Python; search for places."""
-    _search_a_pose()
     for (robot, sensor), policy in twin.state.policies.items():
         channel = twin.state.channels[robot, sensor]
-        if policy.upkeep.repeats != "off":
-            with suppress(Exception):
-                _search_repeats(channel.landmark)
+        if isinstance(policy.association, ByIdentity):
+            continue
+        _search_places()
         mine = [track.id for track in twin.tracks.confirmed.values() if track.model.kind == channel.landmark.kind]
-        if not isinstance(policy.association, ByIdentity) and policy.upkeep.merge and len(mine) > 1:
+        if policy.upkeep.merge and len(mine) > 1:
             with suppress(Exception):
                 make_equal(twin.state, channel, twin.state.moving[robot].slot, [(mine[0], mine[1])])
 
 
-def _search_repeats(landmark: Landmark) -> None:
-    """Search a map in which a place is twice."""
+def _search_places() -> None:
+    """Search a map in which a place is twice, and the pose from which its landmarks are seen."""
     map_, tracks, places = StochasticMap(), Tracks([]), np.random.default_rng(0).uniform(0.0, 9.0, (9, 2))
+    point, known = Point2D(), Known(Point2D())
     for x in (0, 20):
         names = [f"u{x + k}" for k in range(len(places))]
         for name, place in zip(names, places + x, strict=True):
-            slot = map_.add(landmark.space, place, 1e-4 * np.eye(2))
-            tracks.confirm(Track(name, landmark, slot, covisible={*names}))
+            slot = map_.add(point.space, place, 1e-4 * np.eye(2))
+            tracks.confirm(Track(name, point, slot, covisible={*names}))
+            known.add(name, place)
     find_repeats(map_, tracks)
-
-
-def _search_a_pose() -> None:
-    """Search the pose from which landmarks of the plane are seen."""
-    known, places = Known(Point2D()), np.random.default_rng(0).uniform(0.0, 9.0, (9, 2))
-    for k, place in enumerate(places):
-        known.add(k, place)
     search(known, places, np.full(len(places), 0.01))
 
 
