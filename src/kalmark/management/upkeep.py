@@ -47,8 +47,8 @@ class Upkeep:
     merge: Annotated[bool, "Merge landmarks that turn out to be one."] = True
     repeats: Annotated[
         Literal["off", "warn", "merge"],
-        "Search the map for parts that agree under a shift and a turn while it grows: report them, or, as no two places are "
-        "alike, merge them and place a robot by what it maps again.",
+        "Search the map for parts that agree under a shift and a turn while it grows: report them, or, as no places "
+        "are alike, merge them and place a robot by what it maps again.",
     ] = "off"
     hold_back: Annotated[
         bool,
