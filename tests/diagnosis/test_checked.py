@@ -101,6 +101,13 @@ def test_things_that_are_seen_once_each_are_unchecked() -> None:
     assert "nothing was observed twice: no observation checks another one" in [c.evidence for c in verdict.causes]
 
 
+def test_a_robot_that_never_moved_has_no_error_of_its_controls() -> None:
+    log, run_of = simulated("differential_drive", ())
+    first = next(e for e in log.events if isinstance(e, Scan) and len(e.y))
+    verdict = km.diagnose(run_of(replace(log, events=[first for _ in range(6)])))
+    assert not [cause for cause in verdict.causes if cause.name.startswith("odometry")]
+
+
 def test_a_map_of_which_most_observations_are_unused_is_unchecked() -> None:
     log, run_of = simulated("random_field", FIELD)
     run = run_of(log)

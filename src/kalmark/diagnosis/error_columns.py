@@ -169,7 +169,7 @@ def _of_controls(linear: Linear) -> Iterator[Column]:
     A scale is that of the control as estimated.  The measured one has its noise in it: its scale would come out short.
     """
     motions, nothing = linear.problem.motions, np.zeros(len(linear.at.z))
-    e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds)
+    e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds, dtype=np.str_)
     for k, error in sorted(enumerate(motions.errors), key=lambda one: one[1].kind != "scale"):
         turns = error.column.endswith(("_rad", "_radps", TURNING))
         name = "odometry_turn" if turns else "odometry_scale" if error.kind == "scale" else "odometry_offset"
