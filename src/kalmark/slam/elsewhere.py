@@ -126,7 +126,7 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
             _try(state, scan, of)
     elif of.fitted:
         state.pose_hypotheses.pop(robot, None)
-        of.fitted, of.again = {}, []
+        of.fitted = {}
 
 
 def _note(state: State, scan: ScanContext, of: Evidence, look: existence.ObservedAndMissed | None) -> None:
@@ -215,9 +215,12 @@ def locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposa
 
 
 def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
-    """Begin a second hypothesis where a constellation is one of old landmarks, and its robot is not there."""
-    name, r, tracks = scan.event.robot, state.map.mean(scan.robot), state.tracks
-    if of.ratio > -SURE:
+    """Begin a second hypothesis where a constellation is one of old landmarks.
+
+    If nothing shows that the robot is elsewhere, that is a place where it is not, since it left the old one.
+    """
+    name, r, tracks, by_shape = scan.event.robot, state.map.mean(scan.robot), state.tracks, of.ratio > -SURE
+    if by_shape:
         own = [t for t in tracks.confirmed.values() if t.begun[1] == name and tracks.is_invented(t.id)]
         onset_ns, of.searched = of.onset([state.begun_ns(t.id) for t in own], ODDS), tracks.changes
         if onset_ns is None:
@@ -225,15 +228,17 @@ def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
         of.since_ns = onset_ns
     old = older(state, scan, of)
     found = locate(state, scan, of, old)
-    if found is None or is_same_pose(found.T, scan.pose()):
+    if found is None or (by_shape and is_same_pose(found.T, scan.pose())):
         return
     other = state.pose_hypotheses[name] = PoseHypothesis.of(
         state.map, state.moving[name], state.blocks, scan.event.t_ns
     )
     write_robot(other.map, other.moving, moved_with(r[: len(found.T)], scan.pose(), found.T), found.cov)
     of.gain, of.fitted = found.gain, {old.names[row]: 0.0 for row in found.matched if row >= 0}
-    of.p, of.again = found.p, _mapped_again(state, scan, r, other.map.mean(scan.robot), found.cov)
-    of.weigh()
+    of.p = found.p
+    if by_shape:
+        of.again = _mapped_again(state, scan, r, other.map.mean(scan.robot), found.cov)
+        of.weigh()
 
 
 def _pair(scan: ScanContext, places: Array | None, old: Known) -> dict[int, int]:
