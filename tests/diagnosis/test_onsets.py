@@ -19,7 +19,7 @@ from kalmark.diagnosis.causes import Finding
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.onsets import _turns, without_onset
 from kalmark.diagnosis.trials import Trials
-from kalmark.events import Control, Scan
+from kalmark.events import Control, Scan, sort_key
 from kalmark.geometry.frames import compose
 from kalmark.geometry.frames3d import compose as compose3d
 from kalmark.geometry.rotations import exp
@@ -89,7 +89,6 @@ def test_wheels_that_slip_for_a_while_are_named_first_with_both_times(ids: bool)
         ("range_scale", ("rover", "lidar", "range_m"), 0.1, lambda y: y / [1.1, 1.0]),
         ("range_offset", ("rover", "lidar", "range_m"), 0.3, lambda y: y - [0.3, 0.0]),
         ("mount", ("rover", "lidar"), 0.2, lambda y: y - [0.0, -0.2]),
-        ("time_offset", ("rover", "lidar"), 0.2, None),
         ("mount_position", ("rover", "lidar", "x_m"), 0.2, None),
     ],
 )
@@ -111,6 +110,33 @@ def test_an_error_is_taken_out_of_its_part_of_a_log_alone(name: str, of: tuple[s
             within = key == kind and begin_s + 2.0 <= e.t_s < begin_s + 4.0
             have = getattr(e, key)
             np.testing.assert_allclose(getattr(other, key), changed(have) if within else have)
+
+
+def test_scans_of_a_part_of_a_log_alone_are_moved_in_time() -> None:
+    world = load_world("random_field", (*PLANE, "steps=40"))
+    log = simulate(world, 3)
+    run = km.record(build_slam(world.config(), log), log, progress=False, pictures=False)
+    late = Finding("time_offset", ("rover", "lidar"), 0.0, 0.0, 0.5, since_s=2.0, until_s=4.0)
+    begin_s = float(run.history.t_ns[0]) * 1e-9
+    for unit, by in (("s", lambda t_s: 0.5), ("s/s", lambda t_s: 0.5 * (t_s - begin_s))):
+        without = without_onset(run, log, replace(late, unit=unit))
+        assert without is not None
+        have, moved = ([e.t_s for e in of.events if isinstance(e, Scan)] for of in (log, without))
+        expected = [t + by(t) if begin_s + 2.0 <= t < begin_s + 4.0 else t for t in have]
+        np.testing.assert_allclose(moved, sorted(expected), atol=1e-8)
+        assert [e.t_ns for e in without.events] == sorted(e.t_ns for e in without.events)
+
+
+def test_a_clock_that_drifts_is_named_with_how_much_it_gains() -> None:
+    world = load_world("random_field", PLANE)
+    log, config = simulate(world, 3), world.config()
+    late = [replace(e, t_ns=round(1.004 * e.t_ns)) if isinstance(e, Scan) else e for e in log.events]
+    log = replace(log, events=sorted(late, key=sort_key))
+    run = km.record(build_slam(config, log), log, progress=False, config=config_dict(config), pictures=False)
+    cause = km.diagnose(run).causes[0]
+    assert cause.name == "time_offset"
+    gains_s = cause.evidence.split("the clock of rover.lidar gains ")[1].split()[0]
+    assert float(gains_s) == pytest.approx(0.004, rel=0.1)
 
 
 def test_the_associations_of_a_run_that_fits_are_those_it_has() -> None:

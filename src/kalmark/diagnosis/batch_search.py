@@ -16,7 +16,7 @@ from kalmark.diagnosis import repeated_events
 from kalmark.diagnosis.cause_search import Search
 from kalmark.diagnosis.error_columns import Where
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.trials import HARDER, SOLVED, Trials, fit_of_run
+from kalmark.diagnosis.trials import SOLVED, Trials, fit_of_run
 from kalmark.errors import KalmarkError
 from kalmark.events import Control, Event
 from kalmark.logs.log import Log
@@ -76,8 +76,8 @@ def associated(run: Run, log: Log, trials: Trials) -> Run:
     out: then nothing of it is left in the residuals.  The batch problem has the noise that is stated.
     """
     robots, before = run.final_slam().robots, fit_of_run(run)
-    work = HARDER * trials.work_of(log.events)  # of what may be of more landmarks
-    if not run.config.get("robots") or not trials.pays("associations of less certain controls", work):
+    paid = trials.pays("associations of less certain controls", trials.work_of(log.events))
+    if not run.config.get("robots") or not paid:
         return run
 
     def widened(e: Event) -> Event:

@@ -94,10 +94,8 @@ def _by_batch(run: Run, log: Log, first: list[Cause], found: Searched) -> Verdic
     effect = effect_of(run, found)
     moved = [f for f in found.search.found if is_misplaced_survey(run, f)]
     status = worst_status(effect.status, status_of(first), DOUBTFUL if moved else OK)
-    of_map = [c for c in first if c.name in OF_MAP]
-    causes = [*of_map, *(c for c in _found(run, log, first, found, effect) if c not in first)]
-    causes = [c for c in first if c not in of_map] + sorted(causes, key=lambda c: -c.score)
-    causes.sort(key=lambda c: c.harmless)
+    causes = [*first, *(c for c in _found(run, log, first, found, effect) if c not in first)]
+    causes.sort(key=lambda c: (c.harmless, c not in first or c.name in OF_MAP, -c.score))
     checked = f"batch solution of {len(found.given.associations.landmark)} observations"
     figures = effect.sigma_factor, effect.accuracy_m, effect.shape_accuracy_m, effect.shift_m
     return Verdict(status, tuple(causes), checked, *figures, effect.robots, found.search)

@@ -13,7 +13,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
-from kalmark.diagnosis.error_columns import Where, columns_of, errors_together, rates_of
+from kalmark.diagnosis.error_columns import DRIFT, LATE, Where, columns_of, errors_together, rates_of
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.onsets import find_onsets
 from kalmark.logs.progress import track
@@ -132,7 +132,7 @@ class Search:
         equal = [f for f, gain in zip(rivals, net, strict=True) if gain > max(net) - LEAST_GAIN]
         of_cause = dict[tuple[str, ...], Finding]()
         for f in equal:
-            cause = (f.name, *f.of[:2])
+            cause = (f.name, *f.of[:2], f.unit)
             of_cause[cause] = max(of_cause.get(cause, f), f, key=lambda one: one.gain)
         one, *others = of_cause.values()
         return replace(one, alike=tuple(others))
@@ -164,8 +164,10 @@ class Search:
     def candidates(self) -> list[Finding]:
         """Return all that may explain what is left."""
         columns = columns_of(self.linear, self.sensors, self.rates)
+        late = (c._replace(unit=DRIFT, Z=c.Z * self.t_s[self.linear.rows.node]) for c in columns if c.name == LATE)
+        every = [*columns, *(c._replace(of=(*c.of, DRIFT)) for c in late)]
         found = [
-            *causes.systematic(self.linear, [*columns, *errors_together(columns)]),
+            *causes.systematic(self.linear, [*every, *errors_together(every)]),
             *causes.noise(self.linear, self.simulated, self.sensors),
             *causes.outliers(self.linear, self.t_s),
             *causes.moving_landmarks(self.linear, self.t_s),

@@ -11,7 +11,7 @@ import numpy as np
 from kalmark.batch.motion_chain import TURNING
 from kalmark.config.tree import EACH, value_at
 from kalmark.diagnosis.causes import TIMES, Finding
-from kalmark.diagnosis.error_columns import ALL, ALSO
+from kalmark.diagnosis.error_columns import ALL, ALSO, DRIFT
 from kalmark.diagnosis.jumps import LISTED, OddControl, step_size
 from kalmark.results.figure_texts import figure
 from kalmark.slam.gaps import MARGIN
@@ -54,7 +54,7 @@ def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
     `config` is the configuration of the run: a new noise is given as a number where it states the old one.
     """
     text = _TELL.get(finding.name) or (_noise if finding.unit == TIMES else _offset)
-    evidence, cure = text(finding, config)
+    evidence, cure = finding.told or text(finding, config)
     if finding.alike:
         others = ", ".join(f"{other.name} of {_sensor(other)} {_value(other)}" for other in finding.alike)
         evidence += f"; the log does not distinguish this from {others}"
@@ -150,6 +150,9 @@ def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
+    if finding.unit == DRIFT:
+        gains = "loses" if finding.value > 0 else "gains"
+        return f"the clock of {_sensor(finding)} {gains} {by} each second{_sure(finding)}", ""
     evidence = f"scans of {_sensor(finding)} were made {by} {early} than their stamps{_sure(finding)}"
     where = finding.of[:1] if finding.of[1] == ALL else finding.of[:2]
     return evidence, log_correction_line(config, "shift_s", where, finding.value)

@@ -50,7 +50,7 @@ class Finding:
     (Z, W), factors of the noise (N,) and of the motion's errors (r,).  `since_s` is when it begins, after the first
     scan, None for all the time, `until_s` when a systematic error ends.  `alike` are causes that explain the same.
     `moved_m` is by how much a place in the map is wrong for it while it was seen.  `at` is where a surveyed landmark
-    seems to be, or the step (q,) of a jump.
+    seems to be, or the step (q,) of a jump.  `told` are evidence and cure of a cause that no data show, but the log.
     """
 
     name: str
@@ -70,6 +70,7 @@ class Finding:
     alike: tuple[Finding, ...] = ()
     moved_m: float | None = None
     at: Array | None = None
+    told: tuple[str, str] | None = None
 
     @property
     def is_steady(self) -> bool:

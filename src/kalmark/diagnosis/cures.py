@@ -5,22 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
 from kalmark.diagnosis.batch_search import MORE, associated, search_causes
 from kalmark.diagnosis.batch_verdict import Verdict, judged
-from kalmark.diagnosis.cause_search import SHARE, Search, joined
+from kalmark.diagnosis.cause_search import ALIKE, SHARE, Search, joined
 from kalmark.diagnosis.cause_texts import finding_text
 from kalmark.diagnosis.causes import LEAST_GAIN, TIMES, Finding
 from kalmark.diagnosis.effect import shape_without
-from kalmark.diagnosis.mistakes import LATE
-from kalmark.diagnosis.named_causes import cause_of
+from kalmark.diagnosis.error_columns import DRIFT, LATE
+from kalmark.diagnosis.named_causes import OF_MAP, begin_s, cause_of
 from kalmark.diagnosis.onsets import without_onset
 from kalmark.diagnosis.structural_causes import structural_causes
-from kalmark.diagnosis.trials import AT_ONCE, FITS, Fit, Trials, fit_of_run, likelihood_gain, with_cure
+from kalmark.diagnosis.trials import AT_ONCE, FITS, Fit, Trials, fit_of_run, likelihood_gain, options_of, with_cure
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
@@ -63,22 +63,24 @@ def with_cures(
     That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
     All together have to gain `least`.
     """
-    suspects = _suspects(verdict.search, TRIED)
+    suspects = _suspects(run, verdict, TRIED)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
     if not doubted and not any(f.name == LATE or f.begins for f in suspects):  # whose sizes are so far from linear
         return verdict
-    tried = chain(also, suspects, _of_less_certain_controls(run, log, most, trials))
+    tried = _errors_to_try(run, log, [*also, *suspects], most, trials)
     taken = _taken_out(run, log, verdict, tried, most, trials)
     if not taken.errors or taken.total < least:
         return verdict
     found = sorted(taken.errors.values(), key=lambda f: -f.gain)
     left = [c for c in taken.rest.causes if c.name not in [f.name for f in found]]
-    worst = {c.name for c in verdict.causes[: 0 if taken.partly else 1]}
-    before = [c for c in left if c.name in worst and not c.harmless][:1]  # is not explained
-    causes = *before, *(cause_of(run, f, log) for f in found), *(c for c in left if c not in before)
+    first = [c.name for c in verdict.causes[: 0 if taken.partly else 1]]  # goes before them if they do not explain it
+    causes = sorted(
+        [*(cause_of(run, f, log) for f in found), *left],
+        key=lambda c: c not in left or c.harmless or c.name not in first,
+    )
     status = worst_status(verdict.map, shape_without(run, taken.run)[0], DOUBTFUL if taken.partly else OK)
-    return replace(verdict, map=status, causes=causes)
+    return replace(verdict, map=status, causes=(*causes,))
 
 
 def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], most: int, trials: Trials) -> _Taken:
@@ -109,9 +111,9 @@ def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], m
         systematic = taken.systematic if one.unit == TIMES else (without, changed)
         taken = _Taken(errors | {key: now}, without, changed, rest, systematic)
         names = [name for name, *_ in taken.errors]
-        tried = [f for f in _suspects(rest.search, 1) if f.name in names or f.gain > SHARE * taken.total]
+        tried = [f for f in _suspects(without, rest, 1) if f.name in names or f.gain > SHARE * taken.total]
         if fit_of_run(without).mean > MISFITS_ALL:
-            tried = chain(tried, _of_less_certain_controls(without, changed, most, trials))
+            tried = _errors_to_try(without, changed, tried, most, trials)
     return taken
 
 
@@ -157,20 +159,36 @@ def _next_size(tried: Mapping[float, float]) -> float:
     return 0.5 * (a + b - left * (c - a) / (right - left))
 
 
-def _of_less_certain_controls(run: Run, log: Log, most: int, trials: Trials) -> Iterator[Finding]:
-    """Yield the systematic errors that a search finds by associations of less certain controls."""
+def _errors_to_try(run: Run, log: Log, suspects: list[Finding], most: int, trials: Trials) -> Iterator[Finding]:
+    """Yield suspects, and the systematic errors that a search finds by associations of less certain controls.
+
+    Noise is the last: it takes up any misfit.
+    """
+    yield from (f for f in suspects if f.unit != TIMES)
     wide = associated(run, log, trials)
     if wide is not run:
         with suppress(KalmarkError, np.linalg.LinAlgError):
             search = search_causes(wide, log, most, max(AT_ONCE, MORE * most), trials).search
             yield from [f for f in steady_errors(search) if f.unit != TIMES][:TRIED]
+    yield from (f for f in suspects if f.unit == TIMES)
 
 
-def _suspects(search: Search | None, most: int) -> list[Finding]:
-    """Return the likeliest errors of a search that are tried: those that are certain, and one that may explain more."""
+def _suspects(run: Run, verdict: Verdict, most: int) -> list[Finding]:
+    """Return the likeliest errors of a verdict that are tried: those that are certain, and one that explains as much.
+
+    And all that the search in the batch problem does not find, and of which a line takes it out: the log without it
+    shows the effects of it.  Causes that only the map shows are effects of others.
+    """
+    search, begin = verdict.search, begin_s(run)
+    names = {*OF_MAP, *(f.name for f in (search.found if search else ()))}
+    others = [c for c in verdict.causes if c.name not in names and not c.harmless and options_of(c.cure)]
+    told = [
+        Finding(c.name, (), c.score, 0.0, 0.0, since_s=c.since_s - begin, told=(c.evidence, c.cure)) for c in others
+    ]
     sure = steady_errors(search)[:most]
-    may_be = search.suspects[:1] if search else []
-    return sure + [f for f in may_be if all(f.gain > one.gain for one in sure)]
+    least, have = ALIKE * max((f.gain for f in sure), default=0.0), {(f.name, f.of) for f in sure}
+    may_be = (f for f in (search.suspects if search else ()) if (f.name, f.of) not in have and f.gain > least)
+    return [*told, *sure, *islice(may_be, 1)]
 
 
 def steady_errors(search: Search | None) -> list[Finding]:
@@ -190,7 +208,7 @@ def without_error(run: Run, log: Log, finding: Finding, trials: Trials) -> Cured
 
     Where the budget pays for the first part of the log alone, run and log are as they are.
     """
-    if finding.begins:
+    if finding.begins or finding.unit == DRIFT:
         changed = without_onset(run, log, finding)
         made = None if changed is None else (run.config, changed, list(changed.events))
     else:

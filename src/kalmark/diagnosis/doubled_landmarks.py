@@ -15,7 +15,7 @@ from scipy.special import chdtr
 
 from kalmark.arrays import Array
 from kalmark.batch.batch_state import Ints
-from kalmark.diagnosis.single_ids import SAME
+from kalmark.diagnosis.single_ids import SAME, SECOND
 from kalmark.geometry.angles import wrap
 from kalmark.results.run import Run
 
@@ -56,7 +56,7 @@ def find_split_landmarks(run: Run) -> list[Pair]:
     scans between others in which it is, so both are in p^2 of them.
     """
     seen, where = _observed_in(run), _places(run)
-    names = [name for name in seen if name in where]
+    names = [name for name in seen if name in where and not name.endswith(SECOND)]
     if len(names) < 2:
         return []
     places = np.array([where[name] for name in names])
@@ -144,9 +144,9 @@ def _places(run: Run) -> dict[str, Array]:
 
 
 def _observed_in(run: Run) -> dict[str, Ints]:
-    """Return the scans (k,) of two landmarks or more in which each landmark without an id was observed."""
+    """Return the scans (k,) of two landmarks or more in which each landmark was observed."""
     h = run.history
-    used = (h.outcome == "associated") & (h.id == "")
+    used = h.outcome == "associated"
     used &= np.bincount(h.step[used], minlength=len(h.t_ns))[h.step] > 1
     if not used.any():
         return {}

@@ -22,7 +22,9 @@ SLOW_S = 1e-3  # least time between two poses
 LENGTHS = ("range", "distance")  # how columns of lengths begin
 ALL = "all sensors"
 ALSO = " and "  # between the columns of wheels that have an error together
-SHARED = ("range_scale", "range_offset", "bearing_offset", "time_offset")  # errors of several sensors
+DRIFT = "s/s"  # the unit of a clock that drifts
+LATE = "time_offset"
+SHARED = ("range_scale", "range_offset", "bearing_offset", LATE)  # errors of several sensors
 
 Where = tuple[str, str]
 
@@ -65,14 +67,14 @@ def errors_together(columns: list[Column]) -> list[Column]:
 
     And the scale of all its wheels: one of a single wheel is a turn.
     """
-    on_wheels, found = {c.of[0] for c in columns if c.of[1] == TURNING}, dict[tuple[str, str], list[Column]]()
+    on_wheels, found = {c.of[0] for c in columns if c.of[1] == TURNING}, dict[tuple[str, ...], list[Column]]()
     for column in columns:
         robot, second, *kind = column.of
         if column.name in SHARED:
-            found.setdefault((column.name, robot), []).append(column)
+            found.setdefault((column.name, robot, column.unit), []).append(column)
         elif robot in on_wheels and kind == ["scale"] and second != TURNING:
-            found.setdefault(("odometry_scale", robot), []).append(column)
-    return [_sum(name, same) for (name, _), same in found.items() if len(same) > 1]
+            found.setdefault(("odometry_scale", robot, ""), []).append(column)
+    return [_sum(name, same) for (name, *_), same in found.items() if len(same) > 1]
 
 
 def _sum(name: str, same: list[Column]) -> Column:
@@ -113,7 +115,7 @@ def _of_sensor(
         if block.group == POSES:
             moving += np.einsum("kij,kj->ki", E[:, :, first : first + dof], rates[block.rows, :dof])
         first += dof
-    yield "time_offset", factor.sensor, "s", math.inf, moving
+    yield LATE, factor.sensor, "s", math.inf, moving
     (observer, *_, seen), d = factor.term.blocks, state.d
     if observer.group == POSES:
         poses = state.groups[POSES][observer.rows]

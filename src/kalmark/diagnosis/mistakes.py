@@ -16,7 +16,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.config.tree import put, robot_section, value_at
 from kalmark.diagnosis.cause_texts import RANGE, log_correction_line
-from kalmark.diagnosis.error_columns import ALL
+from kalmark.diagnosis.error_columns import ALL, LATE
 from kalmark.events import Control, Event, Scan
 from kalmark.results.figure_texts import figure
 from kalmark.results.run import Run
@@ -31,7 +31,6 @@ SPEEDS = {"kilometres per hour": 1 / 3.6, "miles per hour": 0.44704}
 TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6}
 TURNS = ("w_radps", "dtheta_rad", "steering_rad")  # of controls of the plane, to the left
 WHEELS = ("left_rad", "right_rad")
-LATE = "time_offset"
 OPTICAL = {"roll_deg": -90.0, "yaw_deg": -90.0}  # from the axes of a robot to those of a camera
 
 Change = Callable[[Event], Event]

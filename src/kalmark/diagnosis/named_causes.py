@@ -13,8 +13,9 @@ from kalmark.diagnosis.cause_search import Search
 from kalmark.diagnosis.cause_texts import finding_text, odd_control_text
 from kalmark.diagnosis.causes import JUMPS, Finding
 from kalmark.diagnosis.effect import SIGMAS
+from kalmark.diagnosis.error_columns import DRIFT, LATE
 from kalmark.diagnosis.jumps import Controls, merge_jumps
-from kalmark.diagnosis.mistakes import LATE, Mistake
+from kalmark.diagnosis.mistakes import Mistake
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
 from kalmark.diagnosis.trials import fit_of_run
 from kalmark.logs.log import Log
@@ -109,10 +110,14 @@ def _increments_s(run: Run, robot: str) -> float:
 def cause_of(run: Run, finding: Finding, log: Log | None) -> Cause:
     """Return a finding as a cause; a jump of a control that is far larger than all others is one of the odometry."""
     since_s, harmless = begin_s(run) + (finding.since_s or 0.0), finding.overstated
-    odd = controls_of(run, log, finding.of[0]).odd(since_s) if finding.name in JUMPS and log is not None else None
+    odd = (
+        controls_of(run, log, finding.of[0]).odd(since_s)
+        if finding.name in JUMPS and finding.at is not None and log is not None
+        else None
+    )
     name, told = finding.name, finding_text(finding, run.config)
     cut = (run.config.get("log") or {}).get("increments") == "cut"
-    if name == LATE and not cut and 0.0 < finding.value < _increments_s(run, finding.of[0]):
+    if name == LATE and finding.unit != DRIFT and not cut and 0.0 < finding.value < _increments_s(run, finding.of[0]):
         more = "a scan between two increments counts at the end of the first, which may be why"
         told = f"{told[0]}; {more}", told[1]
     if odd is not None:

@@ -16,9 +16,9 @@ from kalmark.arrays import Array, Index
 from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
 from kalmark.batch.problem import Factor
 from kalmark.diagnosis.causes import LEAST_GAIN, LEAST_INFORMATION, SEEN, Finding, systematic
-from kalmark.diagnosis.error_columns import Column
+from kalmark.diagnosis.error_columns import ALL, DRIFT, LATE, Column
 from kalmark.diagnosis.linear import Linear
-from kalmark.events import Control, Event, Scan
+from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.geometry.rotations import matrix
 from kalmark.logs.log import Log
 from kalmark.models.observe import MOUNT, sensor_pose
@@ -175,9 +175,9 @@ def _piecewise_gain(linear: Linear, column: Column, row_s: Array, step_s: Array,
 
 # ------------------------------------------------------------------ the log without it
 def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
-    """Return a log without an error in a part of it, of a column of a sensor or of the controls; None of others.
+    """Return a log without an error in a part of it, of a sensor's time or column, or of the controls; None of others.
 
-    Those of a mount are a turn in the plane.
+    Those of a mount are a turn in the plane.  A clock drifts from the first scan on.
     """
     robot, second, *rest = finding.of
     of, s, first_s = run.final_slam().robots[robot], finding.value, run.history.at_s(0)
@@ -186,7 +186,7 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
     names = of.motion.columns if is_control else of.sensors[second].sensor.columns if second in of.sensors else ()
     wanted = [second] if is_control else ["bearing_rad"] if finding.name == TURNED else rest
     k = [names.index(name) for name in wanted if name in names]
-    if not k or finding.name == "mount_position":
+    if not (k or finding.name == LATE) or finding.name == "mount_position":
         return None
     each_s = np.diff([e.t_s for e in log.events if isinstance(e, Control) and e.robot == robot])
 
@@ -206,8 +206,10 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
         within = begin_s <= e.t_s < end_s
         if is_control and isinstance(e, Control) and (within if of.motion.held else begin_s < e.t_s <= end_s):
             return replace(e, u=changed(e.u))
-        if within and isinstance(e, Scan) and e.sensor == second and len(e.y):
-            return replace(e, y=changed(e.y))
-        return e
+        if not within or not isinstance(e, Scan) or second not in (ALL, e.sensor):
+            return e
+        if finding.name == LATE:
+            return replace(e, t_ns=e.t_ns + round(1e9 * s * (e.t_s - first_s if finding.unit == DRIFT else 1.0)))
+        return replace(e, y=changed(e.y)) if len(e.y) else e
 
-    return replace(log, events=[replaced(e) for e in log.events])
+    return replace(log, events=sorted(map(replaced, log.events), key=sort_key))

@@ -24,7 +24,6 @@ from kalmark.results.warnings import TOO_SMALL, signs, window_warnings
 __all__ = ["Cause", "Effect", "Verdict", "diagnose"]
 AGAIN = "log filtered again without the mistake"  # what a verdict was made of
 OF_OUTLIERS = MISFIT, OUTLIERS, MISPLACED, MOVED  # causes that observations which fit nothing explain
-MISFITTING = "from some time on the observations do not fit"
 
 
 def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bool = False) -> Verdict:
@@ -81,7 +80,9 @@ def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:
     misfit = now.mean > MISFITS_ALL or misfits_from(now) is not None
     if verdict.map == OK and misfit and not all(trials.left_out.values()):
         if all(cause.harmless for cause in causes):
-            line = next(iter((*window_warnings(run), *all_misfit(run))), MISFITTING)
+            line = next(
+                iter((*window_warnings(run), *all_misfit(run))), "from some time on the observations do not fit"
+            )
             causes = (Cause(MISFIT, begin_s(run), 0.0, line), *causes)
         verdict = replace(verdict, map=DOUBTFUL, causes=causes)
     return replace(verdict, left_out=tuple(what + since for what, since in trials.left_out.items()))
