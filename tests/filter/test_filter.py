@@ -352,7 +352,7 @@ def test_the_downdate_and_the_transport_equal_their_dense_forms_alone_and_togeth
     np.testing.assert_allclose(full(m), P, atol=1e-10)
     A = np.eye(m.n)
     A[:, 2] += a
-    kernels.transport(m.P, a[:, None].copy(), np.array([2]))
+    kernels.downdate_and_transport(m.P, np.zeros((0, len(a))), a[:, None].copy(), np.array([2]))
     np.testing.assert_allclose(full(m), A @ P @ A.T, atol=1e-9)
     kernels.downdate_and_transport(both.P, V, a[:, None].copy(), np.array([2]))
     np.testing.assert_allclose(full(both), A @ P @ A.T, atol=1e-9)

@@ -46,7 +46,6 @@ from kalmark.filter.kernels import (
     lower_product,
     submatrix,
     take_rows,
-    transport,
 )
 from kalmark.filter.observed_block import (
     Linear,
@@ -485,7 +484,7 @@ def correct_by_average(
     a = retract_in(model, ways, prior, x, correction)[0]
     downdate(P, V)
     add_square(P, spread)
-    transport(P, a, prior.theta)
+    downdate_and_transport(P, V[:0], a, prior.theta)
     return d2, True
 
 

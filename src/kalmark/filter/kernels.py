@@ -253,27 +253,6 @@ def add_square(P: Array, D: Array) -> None:
 
 
 @compiled
-def transport(P: Array, a: Array, theta: Index) -> None:
-    """P <- A P A' with A = I + a e_theta', a (n, axes), theta the rows of as many axes.
-
-    P += a w' + w a', w = P[:, theta] + a P[theta, theta] / 2.
-    """
-    n, axes = a.shape
-    a_T, w_T = np.empty((axes, n)), np.empty((axes, n))
-    for c in range(axes):
-        t = theta[c]
-        for j in range(n):
-            w_T[c, j] = P[t, j] if j <= t else P[j, t]
-            a_T[c, j] = a[j, c]
-    add_half_turn(w_T, a_T, theta)
-    for c in range(axes):
-        for i in range(n):
-            a_i, w_i = a_T[c, i], w_T[c, i]
-            for j in range(i + 1):
-                P[i, j] += a_i * w_T[c, j] + w_i * a_T[c, j]
-
-
-@compiled
 def add_half_turn(w: Array, a: Array, theta: Index) -> None:
     """Add half of P[theta, theta] a to the rows w = P[theta] (axes, n), in place."""
     axes, n = w.shape
@@ -301,7 +280,10 @@ def subtract_product(C: int, stride: int, L: int, rows: int, R: int, columns: in
 
 @compiled
 def downdate_and_transport(P: Array, V: Array, a: Array, theta: Index) -> None:
-    """Compute P (n, n) <- A (P - V' V) A', V (m, n): `downdate` and `transport` in one pass over P."""
+    """P <- A (P - V' V) A' with A = I + a e_theta', V (m, n), a (n, axes), theta the rows of as many axes.  O(n^2 m).
+
+    A P A' = P + a w' + w a', w = P[:, theta] + a P[theta, theta] / 2, in one pass over P with `downdate`.
+    """
     n, axes = a.shape
     q = len(V)
     keep_some(P, V)
