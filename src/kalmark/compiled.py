@@ -153,7 +153,7 @@ def compiled_by_model(function: F) -> F:
 
     @wraps(function)
     def either(model: Any, *more: Any) -> Any:
-        return form_for(model, fast)(model, *more)
+        return (fast if isinstance(model, tuple) else function)(model, *more)
 
     def of_types(model: Any, *more: Any) -> Any:
         def call(model, *more):  # type: ignore[no-untyped-def]

@@ -511,11 +511,7 @@ def label_of_event(event: Event) -> str:
 
 def kind_of(event: Event) -> tuple[str, str, str]:
     """Return the kind of an event, its robot and its sensor ("" of what has none)."""
-    return type(event).__name__, event.robot, _sensor_of(event)
-
-
-def _sensor_of(event: Event) -> str:
-    return event.sensor if isinstance(event, Scan | Raw) else ""
+    return type(event).__name__, event.robot, event.sensor if isinstance(event, Scan | Raw) else ""
 
 
 def sort_key(event: Event) -> tuple[int, int, str, str]:
@@ -528,7 +524,7 @@ def sort_key(event: Event) -> tuple[int, int, str, str]:
     >>> sort_key(km.Scan(0.1, "rover", "lidar", [[4.0, 0.3]]))
     (100000000, 1, 'rover', 'lidar')
     """
-    return event.t_ns, _RANK.get(type(event), 1), event.robot, _sensor_of(event)
+    return event.t_ns, _RANK.get(type(event), 1), *kind_of(event)[1:]
 
 
 def sort_events(events: list[Event]) -> list[Event]:

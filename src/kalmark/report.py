@@ -310,8 +310,8 @@ class Report:
 
     def blank(self, p: int) -> None:
         """Enter that nothing was predicted of any observation, whose innovations have p numbers."""
-        shapes = self.y.shape, (len(self.y), p), (len(self.y), p, p)
-        self.e, self.z, self.Z = (np.full(shape, np.nan) for shape in shapes)
+        K = len(self.y)
+        self.e, self.z, self.Z = np.full(self.y.shape, np.nan), np.full((K, p), np.nan), np.full((K, p, p), np.nan)
 
     def fill(self, rows: Sequence[int], done: Correction) -> None:
         """Enter what was predicted of the observations `rows`; the others stay as they are."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -182,8 +181,7 @@ def test_the_postponed_map_equals_the_dense_one(ids: bool) -> None:
 @pytest.mark.parametrize("estimator", [km.estimators.Invariant(), km.estimators.Ekf(), km.estimators.Fej()], ids=repr)
 def test_a_map_saved_in_the_middle_resumes_bit_for_bit(estimator: Any, tmp_path: Path) -> None:
     events, _ = drive(6, 40, ids=False)
-    straight = slam_of(association=km.association.NearestNeighbour())
-    straight.state.settings = replace(straight.state.settings, estimator=estimator)
+    straight = km.Slam(slam_of().robots.values(), km.association.NearestNeighbour(), estimator)
     run(events[:41], straight)
     (candidates,) = straight.tracks.candidates.values()
     assert len(candidates) > 5

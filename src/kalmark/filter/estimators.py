@@ -56,6 +56,21 @@ def _joined(done: list[Correction]) -> Correction:
     return Correction(e, z, Z, d2, fused, all(part.valid for part in done))
 
 
+def _one_by_one(
+    fuse: Callable[[corrections.Scan], Correction], scan: corrections.Scan, together: Correction
+) -> Correction:
+    """Fuse those of a scan one after the other that could not be fused together."""
+    robot, mount, slots, d, y, R, gate = scan
+    d2, fused = together.d2.copy(), together.fused.copy()
+    for k in np.flatnonzero((d2 <= gate) & (d2 < np.inf)).tolist():
+        one = slice(k, k + 1)
+        done = fuse((robot, mount, slots[one], d, y[one], R[one], gate))
+        fused[k] = done.fused[0]
+        if not done.valid:
+            d2[k] = np.nan
+    return together._replace(d2=d2, fused=fused)
+
+
 class _Estimator:
     """Runs the compiled correction for built-in models and the same source in Python for a user's."""
 
@@ -92,31 +107,14 @@ class _Estimator:
         m, robot_here, mount_here, here = map_.opened(robot, mount, slots, self.transports)
         before = m.x.copy() if self.transports and has_units(m) else None
         scan = robot_here, mount_here, here, d, y, R, gate
-        done = self._fused(model, m, scan, parallax)
+        run, whole, option = form_for(model, type(self).compiled), m.arrays_for(parallax), self._option(m)
+        done = Correction(*run(model, whole, scan, option))
         if not done.valid and not done.fused.any():
-            done = self._one_by_one(model, m, scan, done, parallax)
+            done = _one_by_one(lambda one: Correction(*run(model, whole, one, option)), scan, done)
         if before is not None:
             turn_own_errors(m, robot_here, before)
         map_.finish_correction(robot, self.transports)
         return done
-
-    def _fused(self, model: Any, m: StochasticMap, scan: corrections.Scan, parallax: bool) -> Correction:
-        run = form_for(model, type(self).compiled)
-        return Correction(*run(model, m.arrays_for(parallax), scan, self._option(m)))
-
-    def _one_by_one(
-        self, model: Any, m: StochasticMap, scan: corrections.Scan, together: Correction, parallax: bool
-    ) -> Correction:  # fmt: skip
-        """Fuse those of a scan one after the other that could not be fused together."""
-        robot, mount, slots, d, y, R, gate = scan
-        d2, fused = together.d2.copy(), together.fused.copy()
-        for k in np.flatnonzero((d2 <= gate) & (d2 < np.inf)).tolist():
-            one = slice(k, k + 1)
-            done = self._fused(model, m, (robot, mount, slots[one], d, y[one], R[one], gate), parallax)
-            fused[k] = done.fused[0]
-            if not done.valid:
-                d2[k] = np.nan
-        return together._replace(d2=d2, fused=fused)
 
     def average(self, map_: Map, update: Update, pairs: Index, weights: Array) -> tuple[Array, bool]:
         """Fuse the mean over matchings (H, K), numbers of slots or -1, of these weights (H,); nothing is gated.
@@ -127,16 +125,14 @@ class _Estimator:
         run: Any = form_for(model, corrections.correct_by_average)
         m, robot_here, _, _ = map_.opened(update.robot, update.mount, update.slots, self.transports)
         before = m.x.copy() if self.transports and has_units(m) else None
-        d2, valid = run(model, m.whole, tuple(scan), self._limits(), pairs, weights, self.transports)
+        limits = self._option(m) if self.transports else (1, math.inf)
+        d2, valid = run(model, m.whole, tuple(scan), limits, pairs, weights, self.transports)
         if before is not None:
             turn_own_errors(m, robot_here, before)
         return d2, bool(valid)
 
     def _option(self, map_: StochasticMap) -> Any:
         return None
-
-    def _limits(self) -> tuple[int, float]:
-        return 1, math.inf
 
     def for_fixes(self) -> Any:
         """Return the estimator that fuses absolute positions."""
@@ -186,11 +182,8 @@ class Invariant(_Estimator):
     transports = True
     compiled = corrections.invariant
 
-    def _limits(self) -> tuple[int, float]:
-        return self.iterations, float(self.tolerance)
-
     def _option(self, map_: StochasticMap) -> tuple[int, float]:
-        return self._limits()
+        return self.iterations, float(self.tolerance)
 
     def for_fixes(self) -> Invariant:
         """Return the estimator that fuses absolute positions: a large step must be iterated."""

@@ -133,9 +133,11 @@ def reasons_against_start(
 
     `starts` are the answers that start a landmark; `known` are the observations of landmarks in the map.
     """
+    if attention == EVERYTHING:
+        return {}
     held = [None, *(answer for answer in (DEFERRED, REMAP) if answer not in starts)]
     wanted = [k for k in new if decisions[k][0] not in held and decisions[k][0] not in scan.tracks.slots]
-    if not wanted or attention == EVERYTHING:
+    if not wanted:
         return {}
     empty = not scan.tracks.confirmed
     return attention.worth_a_start(wanted, known, scan.y, image_size(scan.channel.sensor), empty)

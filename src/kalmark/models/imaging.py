@@ -314,7 +314,7 @@ class Segments(_PinHole):
 
     def start_noise(self, y: Array) -> Array:
         """Return the noise (K, 4, 4) of the pixels themselves, which starts a line."""
-        return constant((self.sigma_px**2,) * 4, len(y))
+        return constant((self.sigma_px**2,) * 4, len(y)).copy()
 
     def check(self, y: Array) -> None:
         """Refuse segments y (K, 4) whose ends coincide."""

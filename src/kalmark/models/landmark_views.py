@@ -193,20 +193,16 @@ def residual(y: Array, e: Array, angular: Flags) -> Array:
 def refuse_negative_ranges(y: Array) -> None:
     """Refuse measurements y (K, m) whose first component, a range, is negative."""
     ranges = y[:, 0].tolist()
-    if min(ranges, default=0.0) < 0:
-        i, value = next((i, value) for i, value in enumerate(ranges) if value < 0)
-        raise EventError(f"observation {i}: range is {value} m, expected at least 0")
+    least = min(ranges, default=0.0)
+    if least < 0:
+        raise EventError(f"observation {ranges.index(least)}: range is {least} m, expected at least 0")
 
 
 # ---------------------------------------------------------------------- what the sensors share
 @lru_cache(maxsize=256)
-def _cached(variances: tuple[float, ...], count: int) -> Array:
-    return np.tile(np.diag(variances), (count, 1, 1))
-
-
 def constant(variances: tuple[float, ...], count: int) -> Array:
-    """Return `count` copies of a diagonal covariance (count, m, m)."""
-    return _cached(variances, count).copy()
+    """Return `count` diagonal covariances (count, m, m), to be copied."""
+    return np.tile(np.diag(variances), (count, 1, 1))
 
 
 class Sensing:
@@ -232,7 +228,7 @@ class Sensing:
 
     def noise(self, y: Array) -> Array:
         """Return the noise R (K, p, p) of the innovations of measurements y (K, m)."""
-        return constant(self._variances, len(y))
+        return constant(self._variances, len(y)).copy()
 
     @cached_property
     def _variances(self) -> tuple[float, ...]:

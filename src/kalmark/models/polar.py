@@ -187,7 +187,7 @@ class _Ranging(Expecting):
 
     def noise(self, y: Array) -> Array:
         """Return the noise R (K, m, m) of measurements y (K, m)."""
-        if self.additive:
+        if self.sigma_range_rel == 0.0:
             return super().noise(y)
         return np.asarray(range_noise(self.noise_numbers, np.array(y, dtype=np.float64)))
 
@@ -200,9 +200,7 @@ class _Ranging(Expecting):
         """Return the noise R (K, m, m) of measuring v (K, d): of the expected range, not of the noisy one."""
         return self.noise(self.expect(v)[0])
 
-    def check(self, y: Array) -> None:
-        """Refuse negative ranges."""
-        refuse_negative_ranges(y)
+    check = staticmethod(refuse_negative_ranges)
 
 
 class _Placing(_Ranging, _Polar):

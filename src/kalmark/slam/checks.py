@@ -174,8 +174,8 @@ def measurements(event: Scan, sensor: Sensor, check: Callable[[Array], None] | N
     p = innovation_size(sensor)
     if event.cov is None:
         R = np.asarray(sensor.noise(event.y), np.float64)  # one of whole numbers would be compiled for, too
-        if np.shape(R) != (count, p, p) and not isinstance(sensor, OwnNoise):
-            wrong = f"noise of {count} measurements has shape {np.shape(R)}, expected ({count}, {p}, {p})"
+        if R.shape != (count, p, p) and not isinstance(sensor, OwnNoise):
+            wrong = f"noise of {count} measurements has shape {R.shape}, expected ({count}, {p}, {p})"
             raise EventError(f"{label_of_event(event)}: {event.robot}.{event.sensor}, {type(sensor).__name__}: {wrong}")
         return R
     if event.cov.shape not in ((p, p), (count, p, p)):

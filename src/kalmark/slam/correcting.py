@@ -48,7 +48,8 @@ def correct(state: State, scan: ScanContext, policy: Policy, groups: list[tuple[
         least = surveyed_corrections.gate_of(state, scan, policy) if on_trial else math.inf
         slots = state.tracks.slots_of(names)
         approach = partial(_approach, state, scan, model, slots, rows, None)
-        approach(range(len(rows)), least)
+        if scan.channel.approaches:
+            approach(range(len(rows)), least)
         update = scan.update(model, slots, rows)
         done = (
             surveyed_corrections.correct_by_surveys(state, scan, names, update, least, state.estimator, approach)

@@ -55,11 +55,14 @@ MEANWHILE = "mapped while its robot was elsewhere"
 
 def limit_of(state: State, scan: ScanContext) -> float:
     """Return the d2 up to which an observation with an id is not far off; infinite where the gate is switched off."""
-    return state.policies[scan.key].limit if scan.event.ids is not None and scan.locates else math.inf
+    limit = state.policies[scan.key].limit
+    return limit if limit < math.inf and scan.event.ids is not None and scan.locates else math.inf
 
 
 def misfits(state: State, scan: ScanContext, done: Correction) -> Flags:
     """Return which observations (K,) are left out, by a gate that is set or as far off."""
+    if done.fused.all():
+        return ~done.fused
     most = min(state.policies[scan.key].association.threshold(scan.channel.dof, math.inf), limit_of(state, scan))
     return np.asarray(~done.fused & (done.d2 > most))
 

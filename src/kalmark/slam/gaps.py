@@ -64,7 +64,8 @@ class Gaps:
         """Expect the next control by what a file has.  Raises MapError for controls of another length."""
         if {len(u) for u in (self.largest, *(u for _, u in self.pending))} != {len(self.motion.columns)}:
             raise MapError(f"controls of {self.robot!r} are no arrays of {len(self.motion.columns)} numbers")
-        self._expect_next()
+        if self.last_ns is not None and self.bound_ns is not None:
+            self.late_ns = self.last_ns + self.bound_ns
         if self.since_ns is not None:
             self.late_ns = min(self.late_ns, self.since_ns)
 
@@ -78,7 +79,8 @@ class Gaps:
 
     def _go_on(self, t_ns: int) -> None:
         self.last_ns, self.since_ns, self.left_out_ns = t_ns, None, None
-        self._expect_next()
+        if self.bound_ns is not None:
+            self.late_ns = t_ns + self.bound_ns
 
     def rules_out(self, control: Control) -> bool:
         """Return whether a control is of a motion far beyond the limits that the robot was given."""
@@ -106,10 +108,6 @@ class Gaps:
         D = self.unknown(control.t_ns)
         self._go_on(control.t_ns)
         return D
-
-    def _expect_next(self) -> None:
-        if self.last_ns is not None and self.bound_ns is not None:
-            self.late_ns = self.last_ns + self.bound_ns
 
     def _update_intervals(self) -> None:
         times = np.array([dt for dt, _ in self.pending])

@@ -128,7 +128,7 @@ class HeldInput:
 
     def snapshot(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return what it is now, for `put_back`: its own attributes, and those of its `gaps`."""
-        return {**vars(self)}, {} if self.gaps is None else {**vars(self.gaps)}
+        return vars(self).copy(), {} if self.gaps is None else vars(self.gaps).copy()
 
     def put_back(self, before: tuple[dict[str, Any], dict[str, Any]]) -> None:
         """Make it what it was at a `snapshot`."""
@@ -163,9 +163,7 @@ class HeldInput:
 
     def _lost(self, to_ns: int, u: Array | None = None) -> MotionPart | None:
         """Return what is unknown of the motion up to a time, of increments that are late; u (k,) ends then."""
-        if self.gaps is None or to_ns <= self.gaps.late_ns:
-            return None
-        unknown = self.gaps.unknown(to_ns, u)
+        unknown = None if self.gaps is None else self.gaps.unknown(to_ns, u)
         return None if unknown is None else self._uncontrolled(0.0, unknown)
 
     def _uncontrolled(self, dt_s: float, unknown: Array | None = None) -> MotionPart:

@@ -67,7 +67,7 @@ def locate_in_known_map(state: State, scan: ScanContext, query: Query) -> Locate
 
     A scan that does not determine the pose corrects a Gaussian sum of poses, or waits with the reason.
     """
-    if scan.dimensions != 2 or not (state.tracks.known or state.surveys.trial):
+    if not (state.tracks.known or state.surveys.trial) or scan.dimensions != 2:
         return None
     name = scan.event.robot
     sum_ = state.sums.get(name)

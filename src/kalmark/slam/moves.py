@@ -15,33 +15,31 @@ from kalmark.report import Gap
 from kalmark.slam.held_control import MotionPart
 from kalmark.slam.state import State
 
-Moves = tuple[tuple[str, MotionPart], ...]  # parts of their controls, by the names of robots
 
-
-def advance(state: State, name: str, *others: str, before: Moves = ()) -> tuple[Gap, ...]:
-    """Move robots up to now by the controls they hold, all or none of them; return gaps in their controls.
-
-    `before` are those that move with these: an error puts back the clocks of all.
-    """
+def advance(state: State, *names: str) -> tuple[Gap, ...]:
+    """Move robots up to now by the controls they hold, all or none of them; return gaps in their controls."""
     assert state.t_ns is not None
-    if not others and not before and state.moving[name].held.stays(state.t_ns):
-        return ()
-    held = state.moving[name].held
-    clock = held.snapshot()
+    gaps: tuple[Gap, ...] = ()
+    moves: list[tuple[str, MotionPart]] = []
+    clocks = []
     try:
-        part = held.advance(state.t_ns)
-        moves = before if part is None else (*before, (name, part))
-        if others:
-            gaps = advance(state, *others, before=moves)
-            return (*held.noticed(), *gaps)
-        for moved, part in moves if len(moves) > 1 else ():
-            refuse_nowhere(state, moved, [part])
-        for moved, part in moves:
-            move(state, moved, part)
+        for name in names:
+            held = state.moving[name].held
+            if not held.stays(state.t_ns):
+                clocks.append((held, held.snapshot()))
+                if (part := held.advance(state.t_ns)) is not None:
+                    moves.append((name, part))
+        for name, part in moves if len(moves) > 1 else ():
+            refuse_nowhere(state, name, [part])
+        for name, part in moves:
+            move(state, name, part)
     except EventError:
-        held.put_back(clock)
+        for held, clock in clocks:
+            held.put_back(clock)
         raise
-    return held.noticed()
+    for held, _ in clocks:
+        gaps += held.noticed()
+    return gaps
 
 
 def refuse_nowhere(state: State, name: str, parts: Sequence[MotionPart]) -> None:

@@ -90,7 +90,6 @@ def policy_of(
     kinds = [kind.ray if isinstance(kind, AsPoint) else kind for kind in seen]
     reviews = mount.attention.delete or any(isinstance(kind, Reparametrizable | Segmented) for kind in kinds)
     looks_back = channel.sees_velocity or channel.lags
-    approaches = channel.far is not None or channel.depths
     return Policy(
         association, upkeep, mount.attention, mount.detector, deferred, delayed,
         _starts(association, upkeep), averages(association), upkeep.hold_back and not weighs(association), reviews,
@@ -102,7 +101,7 @@ def policy_of(
         WIDER**2 * gate(SURVEYED, channel.dof)
         if channel.locates_by_ids and association.threshold(1, 0.0) < math.inf else math.inf,
         type(association) is ByIdentity and mount.attention == EVERYTHING and upkeep.p_detect is None
-        and not (reviews or channel.robust is not None or looks_back or approaches),
+        and not (reviews or channel.robust is not None or looks_back or channel.approaches),
     )  # fmt: skip
 
 

@@ -155,13 +155,12 @@ class Slam(Estimate):
             self._refuse_ahead(event, before)
         try:
             report: Report = take(event)
-            if not isinstance(event, Raw):
+            if state.sources and take != self._raw:
                 state.settle()
             if event.robot in state.standing:
                 report.standing = state_corrections.correct_by_rest(state, event)
             if event.t_ns != before:
-                self.state.taken.clear()
-                self._ahead = []
+                self.state.taken, self._ahead = set(), []
             self.state.taken.add(kind_of(event))
             return report
         except EventError:
@@ -211,18 +210,23 @@ class Slam(Estimate):
     def _scan(self, event: Scan) -> Report:
         state = self.state
         key = event.robot, event.sensor
+        policy = state.policies.get(key)
+        if policy is not None and event.of is None:
+            return self._found(event if policy.detector is None else policy.detector(event))
         if key in state.of_blocks:
             return correct_by_blocks(state, event, state.of_blocks[key])
         if event.of is not None:
             raise EventError(f"{label_of_event(event)}: of has names of blocks, expected those of a sensor of blocks")
         if key in state.readers:
             return state_corrections.correct_by_reading(state, event, state.readers[key])
-        policy = self._policy(event)
-        return self._found(event if policy.detector is None else policy.detector(event))
+        raise self._no_sensor(event)
 
     def _raw(self, event: Raw) -> Report:
         """Take what a detector, or the source of a sensor, finds in raw data."""
-        source, detector = self.state.sources.get((event.robot, event.sensor)), self._policy(event).detector
+        policy = self.state.policies.get((event.robot, event.sensor))
+        if policy is None:
+            raise self._no_sensor(event)
+        source, detector = self.state.sources.get((event.robot, event.sensor)), policy.detector
         if source is not None and isinstance(event, source.takes):
             return self._searched(event, source)
         if isinstance(detector, RawDetector) and isinstance(event, detector.takes):
@@ -271,13 +275,10 @@ class Slam(Estimate):
         state.sources = self.state.sources
         self.state = state
 
-    def _policy(self, event: Scan | Raw) -> Policy:
-        """Return the policy for what a sensor of landmarks saw.  Raises EventError."""
-        policy = self.state.policies.get((event.robot, event.sensor))
-        if policy is None:
-            names = sorted(self.state.robots[event.robot].sensors)
-            raise EventError(f"{label_of_event(event)}: sensor is {event.sensor!r}, expected one of {names}")
-        return policy
+    def _no_sensor(self, event: Scan | Raw) -> EventError:
+        """Return the error of an event whose robot has no such sensor of landmarks."""
+        names = sorted(self.state.robots[event.robot].sensors)
+        return EventError(f"{label_of_event(event)}: sensor is {event.sensor!r}, expected one of {names}")
 
     def _found(self, event: Scan) -> Report:
         """Take what was found of landmarks."""
@@ -302,10 +303,10 @@ class Slam(Estimate):
         ids = event.ids or (None,) * len(event.y)
         seen = [i for i in ids if i in state.robots and i != event.robot] if len(state.robots) > 1 else []
         gaps = moves.advance(state, event.robot, *seen)
-        robot, report = state.moving[event.robot].slot, Report(event, event.y)
+        moving, report = state.moving[event.robot], Report(event, event.y)
         report.gaps = gaps
         scan = ScanContext(
-            state.map, state.tracks, state.clones, state.estimator, channel, robot, event, ids, R, report
+            state.map, state.tracks, state.clones, state.estimator, channel, moving.slot, event, ids, R, report
         )  # fmt: skip
         if len(event.y) and state.repeats(key, event.t_ns, event.y, event.ids):
             return record_repeated_reading(report, ids, channel.dof)
@@ -317,9 +318,8 @@ class Slam(Estimate):
             report.observations = tuple(Observation(k, i, "ignored", None, None, why) for k, i in enumerate(ids))
         elif len(event.y):
             self._fuse(scan, policy)
-            held = state.moving[event.robot].held
-            if (gaps or held.is_adrift) and any(o.outcome == "associated" for o in report.observations):
-                held.located(event.t_ns, locating.is_heading_known(scan))
+            if (gaps or moving.held.is_adrift) and any(o.outcome == "associated" for o in report.observations):
+                moving.held.located(event.t_ns, locating.is_heading_known(scan))
         maintenance.maintain(state, scan, policy)
         if channel.counts:
             with suppress(MapError):  # it is full: the next scan is the first again

@@ -177,11 +177,12 @@ def initialize_delayed(
     state: State, scan: ScanContext, policy: Policy, new: list[int], decisions: Sequence[Decision]
 ) -> list[Observation]:
     """Keep measurements of no landmark as pending; start the landmarks that enough of them determine.  [T] 2."""
-    names = {k: decisions[k][0] for k in new}
-    ids: dict[int, Id | None] = {k: None for k, n in names.items() if n is NEW}
-    ids |= {k: n for k, n in names.items() if isinstance(n, int | str) and not state.is_there(n)}
-    ids, way, key = {k: ids[k] for k in new if k in ids}, policy.delayed, scan.key
-    if way is None or not ids:
+    way, key = policy.delayed, scan.key
+    if way is None:
+        return []
+    ids: dict[int, Id | None] = {k: None if n is NEW else n for k in new  # type: ignore[misc]
+        if (n := decisions[k][0]) is NEW or (isinstance(n, int | str) and not state.is_there(n))}  # fmt: skip
+    if not ids:
         return []
     held = state.clones.of(key)
     if not delayed.has_moved(scan, held[-1] if held else None, way):

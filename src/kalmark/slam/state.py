@@ -113,6 +113,7 @@ class State:
 
     def __init__(self, robots: dict[str, Robot], settings: Settings) -> None:
         self.settings, self.robots, self.t_ns, self.taken, self.placed = settings, robots, None, set(), 0
+        self.estimator: Estimator = settings.estimator
         self.map, self.balance, self.tracks = new_map(settings.map, settings.numbers), CostBalance(), Tracks(robots)
         self.clones, self.surveys, self.given, self.pose_hypotheses, self.sums = Clones(), Surveys(), {}, {}, {}
         self.evidence = {}
@@ -139,11 +140,6 @@ class State:
     def begins(self) -> bool:
         """True if a source still keeps its first scans, which alone are to move the map."""
         return any(source.begins for source in self.sources.values())
-
-    @property
-    def estimator(self) -> Estimator:
-        """The estimator of the map: prediction and correction."""
-        return self.settings.estimator
 
     def _place(self, robot: Robot, kinds: list[Landmark]) -> None:
         """Enter a robot, the bias of its controls and its mounts into the map.  Raises ModelError."""

@@ -37,6 +37,8 @@ def confirm_tentative(state: State, scan: ScanContext, policy: Policy, new: list
     seen: dict[int, Observation],
 ) -> dict[int, tuple[Id, str]]:  # fmt: skip
     """Count the observations of tentative landmarks; return those that confirm one, which is one from here on."""
+    if not state.tracks.tentative:
+        return {}
     state.tracks.rename_tentative(scan.event.ids or ())
     rows = [k for k in new if decisions[k][0] in policy.starts]
     lost = np.array([decisions[k][0] is REMAP for k in rows], dtype=np.bool_)

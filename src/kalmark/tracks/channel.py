@@ -173,6 +173,7 @@ class Channel:
             self.far = ObservationModel(landmark, TagPose(), self.at)
         rays = any(isinstance(model.landmark, AsPoint) for model in self.models.values())
         self.depths = rays and (full or not self.sees_velocity)  # it determines depths; a range rate alone does not
+        self.approaches = self.far is not None or self.depths  # what is far from its expectation
 
     def _models(self, others: Sequence[Landmark]) -> dict[str, ObservationModel]:
         """Return the models of all kinds of blocks that this sensor can observe: its landmarks and those like them."""

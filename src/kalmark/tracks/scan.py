@@ -37,15 +37,15 @@ class Start(NamedTuple):
     @property
     def is_finite(self) -> bool:
         """True if all its numbers are finite."""
-        return all(bool(np.isfinite(a).all()) for a in (self.mean, self.G, self.Q))
+        return bool(np.isfinite(self.mean).all() and np.isfinite(self.G).all() and np.isfinite(self.Q).all())
 
 
 @dataclass(slots=True, eq=False)
 class ScanContext:
     """A scan of K observations with their ids and noise R (K, p, p), and the state it is read against.
 
-    `robot` is the slot of the robot that observes, `report` the answer that is being made.  A robot is `adrift` while a
-    gap leaves its heading unknown.
+    `y` are the measurements (K, m), `key` are robot and sensor, `robot` is the slot of the robot that observes,
+    `report` the answer that is being made.  A robot is `adrift` while a gap leaves its heading unknown.
     """
 
     map: Map
@@ -59,16 +59,11 @@ class ScanContext:
     R: Array
     report: Report = field(repr=False)
     adrift: bool = False
+    y: Array = field(init=False, repr=False)
+    key: ChannelKey = field(init=False, repr=False)
 
-    @property
-    def y(self) -> Array:
-        """The measurements (K, m)."""
-        return self.event.y
-
-    @property
-    def key(self) -> ChannelKey:
-        """Robot and sensor."""
-        return self.event.robot, self.event.sensor
+    def __post_init__(self) -> None:
+        self.y, self.key = self.event.y, (self.event.robot, self.event.sensor)
 
     @property
     def reported(self) -> tuple[str | None, ...] | None:
@@ -85,10 +80,13 @@ class ScanContext:
 
     def add_reports(self, names: Sequence[Any], rows: Iterable[int], used: Iterable[bool]) -> None:
         """Add the classes that the observations `rows` (K,) report to their landmarks, where they were `used`."""
-        for name, k, fused in zip(names, rows, used, strict=True) if self.reported is not None else ():
+        reported, classes = self.event.classes, self.channel.classes
+        if reported is None or classes is None:
+            return
+        for name, k, fused in zip(names, rows, used, strict=True):
             track = self.tracks.confirmed.get(name) or self.tracks.tentative.get(name)
-            if fused and track is not None and self.reported is not None and self.channel.classes is not None:
-                add_report(track.classes, self.channel.classes, self.reported[k])
+            if fused and track is not None:
+                add_report(track.classes, classes, reported[k])
 
     @property
     def own_noise(self) -> bool:
