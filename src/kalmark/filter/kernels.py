@@ -129,20 +129,26 @@ def quadratic(A: Array, S: Array) -> Array:
 
 @compiled
 def lower_product(M: Array, B: Array) -> Array:
-    """Return M B of a lower triangle M (m, m) and B (m, n), four rows of B at a time."""
+    """Return M B of a lower triangle M (m, m), zero elsewhere, and B (m, n), two rows by four of B at a time."""
     m, n = B.shape
     out = np.zeros((m, n))
-    for i in range(m):
+    for k in range(m % 2 * n):
+        out[0, k] = M[0, 0] * B[0, k]
+    for i in range(m % 2, m, 2):
         j = 0
-        while j + 4 <= i + 1:
+        while j + 4 <= i + 2:
             a, b, c, d = M[i, j], M[i, j + 1], M[i, j + 2], M[i, j + 3]
+            e, f, g, h = M[i + 1, j], M[i + 1, j + 1], M[i + 1, j + 2], M[i + 1, j + 3]
             for k in range(n):
-                out[i, k] += a * B[j, k] + b * B[j + 1, k] + c * B[j + 2, k] + d * B[j + 3, k]
+                r, s, t, u = B[j, k], B[j + 1, k], B[j + 2, k], B[j + 3, k]
+                out[i, k] += a * r + b * s + c * t + d * u
+                out[i + 1, k] += e * r + f * s + g * t + h * u
             j += 4
-        while j <= i:
-            a = M[i, j]
+        while j < i + 2:
+            a, e = M[i, j], M[i + 1, j]
             for k in range(n):
                 out[i, k] += a * B[j, k]
+                out[i + 1, k] += e * B[j, k]
             j += 1
     return out
 
@@ -208,10 +214,12 @@ def clear_block(P: Array, n: int, at: int, d: int) -> None:
 @compiled
 def keep_some(P: Array, V: Array) -> None:
     """Raise the diagonal of P (n, n) by `KEPT` of that of V' V, V (q, n): more than its subtraction rounds."""
-    q, n = V.shape
-    for k in range(q):
-        for i in range(n):
-            P[i, i] += KEPT * V[k, i] * V[k, i]
+    lost = np.zeros(V.shape[1])
+    for k in range(len(V)):
+        for i in range(len(lost)):
+            lost[i] += V[k, i] * V[k, i]
+    for i in range(len(lost)):
+        P[i, i] += KEPT * lost[i]
 
 
 @compiled

@@ -37,6 +37,8 @@ def append_constants(
     With a `shared` error the control's noise is that of the first of them, which `begins` or goes on.
     """
     (n, c), m = R_a.shape, len(N) if begins else 0
+    if c == 0:
+        return F, Q
     size = n + c
     F_all, Q_all = np.eye(size), np.zeros((size, size))
     for i in range(n):
