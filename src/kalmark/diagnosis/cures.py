@@ -174,20 +174,27 @@ def _errors_to_try(run: Run, log: Log, suspects: list[Finding], most: int, trial
 
 
 def _suspects(run: Run, verdict: Verdict, most: int) -> list[Finding]:
-    """Return the likeliest errors of a verdict that are tried: those that are certain, and one that explains as much.
+    """Return the likeliest errors of a verdict that are tried: those that are certain, and one that may explain more.
 
-    And all that the search in the batch problem does not find, and of which a line takes it out: the log without it
-    shows the effects of it.  Causes that only the map shows are effects of others.
+    Of an error of the same name, as an offset beside a drift, that is one which explains about as much.  And all
+    that the search in the batch problem does not find, and of which a line takes it out: the log without it shows the
+    effects of it.  Causes that only the map shows are effects of others.
     """
-    search, begin = verdict.search, begin_s(run)
-    names = {*OF_MAP, *(f.name for f in (search.found if search else ()))}
-    others = [c for c in verdict.causes if c.name not in names and not c.harmless and options_of(c.cure)]
+    search = verdict.search
+    found, suspects = (search.found, search.suspects) if search else ([], [])
+    rest = [
+        c
+        for c in verdict.causes
+        if c.name not in {*OF_MAP, *(f.name for f in found)} and not c.harmless and options_of(c.cure)
+    ]
     told = [
-        Finding(c.name, (), c.score, 0.0, 0.0, since_s=c.since_s - begin, told=(c.evidence, c.cure)) for c in others
+        Finding(c.name, (), c.score, 0.0, 0.0, since_s=c.since_s - begin_s(run), told=(c.evidence, c.cure))
+        for c in rest
     ]
     sure = steady_errors(search)[:most]
-    least, have = ALIKE * max((f.gain for f in sure), default=0.0), {(f.name, f.of) for f in sure}
-    may_be = (f for f in (search.suspects if search else ()) if (f.name, f.of) not in have and f.gain > least)
+    largest, have = max((f.gain for f in sure), default=0.0), {f.name: f.of for f in sure}
+    others = (f for f in suspects if have.get(f.name) != f.of)
+    may_be = (f for f in others if f.gain > (ALIKE if f.name in have else 1.0) * largest)
     return [*told, *sure, *islice(may_be, 1)]
 
 
