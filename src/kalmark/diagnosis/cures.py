@@ -182,19 +182,15 @@ def _suspects(run: Run, verdict: Verdict, most: int) -> list[Finding]:
     """
     search = verdict.search
     found, suspects = (search.found, search.suspects) if search else ([], [])
-    rest = [
-        c
-        for c in verdict.causes
-        if c.name not in {*OF_MAP, *(f.name for f in found)} and not c.harmless and options_of(c.cure)
-    ]
+    known = {*OF_MAP, *(f.name for f in found)}
     told = [
         Finding(c.name, (), c.score, 0.0, 0.0, since_s=c.since_s - begin_s(run), told=(c.evidence, c.cure))
-        for c in rest
+        for c in verdict.causes
+        if not c.harmless and c.name not in known and options_of(c.cure)
     ]
     sure = steady_errors(search)[:most]
     largest, have = max((f.gain for f in sure), default=0.0), {f.name: f.of for f in sure}
-    others = (f for f in suspects if have.get(f.name) != f.of)
-    may_be = (f for f in others if f.gain > (ALIKE if f.name in have else 1.0) * largest)
+    may_be = (f for f in suspects if f.gain > (ALIKE if have.get(f.name, f.of) != f.of else 1.0) * largest)
     return [*told, *sure, *islice(may_be, 1)]
 
 

@@ -313,8 +313,8 @@ def split_landmarks(run: Run) -> Iterator[Cause]:
         first = ", ".join(f"{pair.name} and {pair.other}" for pair in pairs[:LISTED])
         told = "seen in turn and never together with their neighbours, so they are the same things"
         evidence = f"{number} of {mapped} landmarks are {told} ({first}{', ...' if len(pairs) > LISTED else ''})"
-        cure = "a noise that is stated too small splits landmarks: state more"
-        cure = "give each thing one id" if (run.history.id == pairs[0].name).any() else cure
+        more = "a noise that is stated too small splits landmarks: state more"
+        cure = "give each thing one id" if pairs[0].name in run.history.id else more
         yield Cause(
             "split_landmarks", begin_s(run), sum(p.score for p in pairs), evidence, cure, number <= FEW * mapped
         )
