@@ -169,9 +169,11 @@ def _of_controls(linear: Linear) -> Iterator[Column]:
     """Yield the systematic errors of the controls, scales before offsets: the likelier of two that are alike.
 
     A scale is that of the control as estimated.  The measured one has its noise in it: its scale would come out short.
+    The `most` of an offset is its share of the robot's way, as that of a scale: bearings alone explain any way by none.
     """
     motions, nothing = linear.problem.motions, np.zeros(len(linear.at.z))
     e, kinds = linear.errors_of(linear.residuals), np.array(motions.kinds, dtype=np.str_)
+    ways = dict[str, float]()
     for k, error in sorted(enumerate(motions.errors), key=lambda one: one[1].kind != "scale"):
         turns = error.column.endswith(("_rad", "_radps", TURNING))
         name = "odometry_turn" if turns else "odometry_scale" if error.kind == "scale" else "odometry_offset"
@@ -185,7 +187,11 @@ def _of_controls(linear: Linear) -> Iterator[Column]:
             )
             added = (linear.root @ np.where(mine, e, 0.0)).reshape(-1, linear.state.spaces[POSES].dof)
             W = W + (added * ([0.0, 0.0, 1.0] if of_turns else 1.0)).ravel()
-        most = math.inf if error.unit else MOST_SCALE
+        size, most = float(np.linalg.norm(W)), math.inf if error.unit else MOST_SCALE
+        if name == "odometry_scale":
+            ways[error.robot] = math.hypot(ways.get(error.robot, 0.0), size)
+        elif name == "odometry_offset":
+            most = MOST_SCALE * ways.get(error.robot, math.inf) / max(size, 1e-300)
         yield Column(name, (error.robot, error.column, error.kind), error.unit, nothing, W, most)
 
 
