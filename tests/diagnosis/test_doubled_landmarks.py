@@ -25,6 +25,7 @@ def seen(*scans: str, **places: tuple[float, float]) -> Any:
     vars(history).update(
         t_ns=np.arange(len(scans)) * 10**9, step=step, landmark=np.array([*"".join(scans)]),
         outcome=np.full(len(step), "associated"), id=np.full(len(step), ""), robot=np.full(len(scans), "rover"),
+        sensor=np.full(len(step), "lidar"),
     )  # fmt: skip
     means = [np.array(place) for place in places.values()]
     return SimpleNamespace(history=history, landmarks=SimpleNamespace(ids=[*places], means=means, in_space=False))
@@ -38,6 +39,13 @@ def test_one_thing_is_seen_in_turn_and_two_are_seen_together() -> None:
     assert not doubled_landmarks.find_split_landmarks(
         seen(*12 * ("ac", "bc", "abc", "ac", "bc"), a=NEAR, b=FAR, c=POST)
     )
+
+
+def test_two_sensors_are_never_in_one_scan() -> None:
+    in_turn = seen(*12 * ("ac", "bc", "ac", "ac", "bc"), a=NEAR, b=FAR, c=POST)
+    of_b = np.isin(in_turn.history.step, in_turn.history.step[in_turn.history.landmark == "b"])
+    vars(in_turn.history)["sensor"] = np.where(of_b, "rear", "front")
+    assert not doubled_landmarks.find_split_landmarks(in_turn)
 
 
 def test_two_sides_of_a_wall_and_scans_of_single_landmarks_say_nothing() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import chdtr
 
-from kalmark.arrays import Array
+from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import Ints
 from kalmark.diagnosis.single_ids import SAME, SECOND
 from kalmark.geometry.angles import wrap
@@ -52,22 +52,23 @@ class Pair(NamedTuple):
 def find_split_landmarks(run: Run) -> list[Pair]:
     """Return pairs of near landmarks that are one thing.
 
-    They are observed in turn, within a few scans, but never together.  Of two things, each is seen in a share p of the
-    scans between others in which it is, so both are in p^2 of them.
+    They are observed in turn by one sensor, within a few of its scans, but never together.  Of two things, each is seen
+    in a share p of the scans between others in which it is, so both are in p^2 of them.
     """
-    seen, where = _observed_in(run), _places(run)
-    names = [name for name in seen if name in where and not name.endswith(SECOND)]
-    if len(names) < 2:
-        return []
-    places = np.array([where[name] for name in names])
-    never = -np.log1p(-(_regularity(seen.values()) ** 2))
-    least, found = np.log(len(names) * NEIGHBOURS / SELDOM), []
-    near = cKDTree(places).query(places, k=range(2, 2 + min(NEIGHBOURS, len(names) - 1)))[1]
-    for a, b in sorted({(min(k, j), max(k, j)) for k, others in enumerate(near.tolist()) for j in others}):
-        score = float(never * _in_turn(seen[names[a]], seen[names[b]]))
-        if score > least:
-            found.append(Pair(names[a], names[b], score))
-    return found
+    h, where, found = run.history, _places(run), dict[tuple[str, str], Pair]()
+    for key in sorted({*h.sensor_keys()}):
+        seen = _observed_in(run, h.made_by(*key))
+        names = [name for name in seen if name in where and not name.endswith(SECOND)]
+        if len(names) < 2:
+            continue
+        places = np.array([where[name] for name in names])
+        never, least = -np.log1p(-(_regularity(seen.values()) ** 2)), np.log(len(names) * NEIGHBOURS / SELDOM)
+        near = cKDTree(places).query(places, k=range(2, 2 + min(NEIGHBOURS, len(names) - 1)))[1]
+        for a, b in sorted({(min(k, j), max(k, j)) for k, others in enumerate(near.tolist()) for j in others}):
+            pair = Pair(names[a], names[b], float(never * _in_turn(seen[names[a]], seen[names[b]])))
+            if pair.score > least:
+                found[pair[:2]] = pair
+    return [*found.values()]
 
 
 class Revisits(NamedTuple):
@@ -143,16 +144,20 @@ def _places(run: Run) -> dict[str, Array]:
     return {name: place for name, place in where.items() if np.isfinite(place).all()}
 
 
-def _observed_in(run: Run) -> dict[str, Ints]:
-    """Return the scans (k,) of two landmarks or more in which each landmark was observed."""
+def _observed_in(run: Run, mine: Flags) -> dict[str, Ints]:
+    """Return the scans (k,) of two landmarks or more in which each landmark was observed, by `mine` (O,) of all.
+
+    They are numbered as those of that sensor.
+    """
     h = run.history
-    used = h.outcome == "associated"
+    used = mine & (h.outcome == "associated")
     used &= np.bincount(h.step[used], minlength=len(h.t_ns))[h.step] > 1
     if not used.any():
         return {}
     order = np.argsort(h.landmark[used], kind="stable")
     names, first = np.unique(h.landmark[used][order], return_index=True)
-    return dict(zip(names.tolist(), np.split(h.step[used][order], first[1:]), strict=True))
+    scans = np.searchsorted(np.unique(h.step[mine]), h.step[used][order])
+    return dict(zip(names.tolist(), np.split(scans, first[1:]), strict=True))
 
 
 def _regularity(all_scans: Iterable[Ints]) -> float:
