@@ -281,12 +281,11 @@ def _misfit(of: Fit, begin: int = 0, end: int | None = None) -> float:
 
 
 def first_of(made: Sequence[Mistake]) -> Mistake | None:
-    """Return the change with the largest gain.  Its evidence names those of nearly equal gain."""
+    """Return the change with the largest gain, the first one of several.  Its evidence names those of nearly that."""
     if not made:
         return None
-    most = max(one.gain for one in made)
-    first, *others = (one for one in made if one.gain >= ALIKE * most)
-    alike = "; or: ".join(one.evidence for one in others)
+    first = max(made, key=lambda one: round(one.gain))
+    alike = "; or: ".join(one.evidence for one in made if one is not first and one.gain >= ALIKE * first.gain)
     if not alike:
         return first
     return first._replace(evidence=f"{first.evidence}; the log does not distinguish this from: {alike}")

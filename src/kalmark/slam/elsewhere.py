@@ -122,8 +122,8 @@ def weigh(state: State, scan: ScanContext, look: existence.ObservedAndMissed | N
     is_unique = state.policies[scan.key].upkeep.repeats == "merge"  # then no two places are alike
     if of.ratio <= -SURE or is_unique:
         is_tried = robot in state.pose_hypotheses and bool(of.fitted)
-        is_due = of.ratio <= -SURE or scan.tracks.changes - of.searched >= GROWN
-        if is_due and not is_tried and (look is not None or all_named):
+        is_due = not is_tried if of.ratio <= -SURE else scan.tracks.changes - of.searched >= GROWN
+        if is_due and (look is not None or all_named):
             _propose(state, scan, of)
         if of.fitted and robot in state.pose_hypotheses and (is_tried or all_named):
             _try(state, scan, of)
@@ -220,7 +220,8 @@ def locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposa
 def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
     """Begin a second hypothesis where a constellation is one of old landmarks.
 
-    If nothing shows that the robot is elsewhere, that is a place where it is not, since it left the old one.
+    If nothing shows that the robot is elsewhere, that is a place where it is not, since it left the old one, or a
+    likelier one than the last.
     """
     name, r, tracks, by_shape = scan.event.robot, state.map.mean(scan.robot), state.tracks, of.ratio > -SURE
     if by_shape:
@@ -231,7 +232,7 @@ def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
         of.since_ns = onset_ns
     old = older(state, scan, of)
     found = locate(state, scan, of, old)
-    if found is None or (by_shape and is_same_pose(found.T, scan.pose())):
+    if found is None or (by_shape and (is_same_pose(found.T, scan.pose()) or found.gain < of.gain)):
         return
     other = state.pose_hypotheses[name] = PoseHypothesis.of(
         state.map, state.moving[name], state.blocks, scan.event.t_ns
@@ -279,7 +280,8 @@ def _try(state: State, scan: ScanContext, of: Evidence) -> None:
     of.count(logs)
     if of.gain - of.ratio >= math.log(ODDS) and fits:
         again = locate(state, scan, of, old) if None in scan.ids else None
-        if None not in scan.ids or (again and {old.names[row] for row in again.matched if row >= 0} <= {*of.fitted}):
+        matched = {old.names[row] for row in again.matched if row >= 0} if again else set()
+        if None not in scan.ids or 2 * len(matched & of.fitted.keys()) > len(matched):
             _place(state, scan, of, other, fits)
     elif of.gain <= -SURE:
         del state.pose_hypotheses[robot]
