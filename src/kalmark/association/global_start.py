@@ -63,8 +63,8 @@ class GlobalPose(NamedTuple):
 class Proposal(NamedTuple):
     """A pose T of a sensor, (3,) or (7,), its covariance, the landmark of each observation (K,) and the log odds.
 
-    These are against chance; a landmark counts at most `SURE`, what has no ids twice that.  An observation without an
-    id is at a landmark from a wrong pose with the probability p.
+    These are against chance; a landmark counts at most `SURE`, but for those that determine the pose.  An observation
+    without an id is at a landmark from a wrong pose with the probability p.
     """
 
     T: Array
@@ -414,7 +414,8 @@ def chance_of_fit(of: Known, sigma: Array, pairs: int, count: int, tried: int) -
     """Return the probability that an observation is at a landmark from a wrong pose.
 
     It is that of landmarks anywhere, or, if it is larger, that with which one of so many poses is expected to have as
-    many pairs of `count` as the best wrong one: landmarks in rows agree with themselves elsewhere.
+    many pairs of `count` as the best wrong one: landmarks in rows agree with themselves elsewhere.  As in a repeat of
+    the map (Desolneux, Moisan and Morel 2008, ch. 3).
     """
     p = min(1.0, of.density() * math.pi * chi2_gate(REACH, 2) * float(np.mean(sigma**2)) * 2.0)
     return max(p, float(betaincinv(pairs - 2, count - pairs + 1, 1.0 / tried))) if pairs > 2 else p

@@ -260,7 +260,7 @@ def _pair(scan: ScanContext, places: Array | None, old: Known) -> dict[int, int]
 def _try(state: State, scan: ScanContext, of: Evidence) -> None:
     """Correct a second hypothesis by a scan; place the robot there if it is certain, and forget it if it does not fit.
 
-    The constellation has to be one of old landmarks there, and nowhere else, still.
+    Without ids the constellation still has to be one of old landmarks, in one place alone, most of which have fitted.
     """
     robot, channel, old = scan.event.robot, scan.channel, older(state, scan, of)
     other, model = state.pose_hypotheses[robot], channel.models[old.model.kind]
