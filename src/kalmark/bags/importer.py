@@ -40,10 +40,8 @@ from kalmark.bags.topics import (
 from kalmark.declare import Values, registered_name
 from kalmark.errors import EventError, LogError
 from kalmark.events import Control, Fix, Frame, Scan, fixed_seconds, sort_key
-from kalmark.geometry import rotations
-from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames3d import compose, inverse
 from kalmark.logs.geodesy import fault, to_tangent_plane
+from kalmark.logs.increments import increment_between
 from kalmark.logs.log import Log, Names, PositionTrack, Section, SensorKey, Trajectory, poses_of_size
 from kalmark.logs.source import Format, Request
 from kalmark.logs.table import Refused
@@ -235,10 +233,7 @@ class _Importer:
 
     def step(self, topic: Topic, a: Array, b: Array) -> Array:
         """Return the control that leads from the pose a (7,) to b: an increment of the plane or of space."""
-        if not self.in_space(topic.robot):
-            return relative_pose(*poses_of_size(np.array([a, b]), 3))
-        step = compose(inverse(a)[0], b)[0]
-        return np.append(step[:3], rotations.log(step[3:]))
+        return increment_between(*poses_of_size(np.array([a, b]), 7 if self.in_space(topic.robot) else 3))
 
     def interpolated(self) -> None:
         """Add the increments that end at the scans and fixes of a robot, on the interpolated path of its odometry.
@@ -391,13 +386,6 @@ def images_of(path: Path, name: str) -> Iterator[Any]:
                 yield decode(received.message)
             except OSError as error:
                 yield error
-
-
-def relative_pose(a: Array, b: Array) -> Array:
-    """Return the pose b (3,) in the frame of a: the way between them."""
-    c, s = np.cos(a[2]), np.sin(a[2])
-    x, y = b[:2] - a[:2]
-    return np.array([c * x + s * y, c * y - s * x, wrap(b[2] - a[2])])
 
 
 BAG = Format(

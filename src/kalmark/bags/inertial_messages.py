@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
@@ -42,19 +41,16 @@ def means(t_ns: Times, w: Array, ends: Sequence[int]) -> list[tuple[int, Array]]
     The first is the rate itself.  An end before which there was no rate since the last one is left out; so are those
     outside the times.
     """
+    from scipy.interpolate import make_interp_spline
+
     inside = [end for end in ends if t_ns[0] <= end <= t_ns[-1]]
-    t = (t_ns - t_ns[0]) * 1e-9
-    area = np.concatenate([np.zeros((1, w.shape[1])), np.cumsum((w[1:] + w[:-1]) / 2 * np.diff(t)[:, None], axis=0)])
     kept: list[int] = []
     for end in inside:
         if not kept or np.searchsorted(t_ns, end, "right") > np.searchsorted(t_ns, kept[-1], "right"):
             kept.append(end)
     if not kept:
         return []
-    at = (np.array(kept) - t_ns[0]) * 1e-9
-    k = np.clip(np.searchsorted(t, at, "right") - 1, 0, max(len(t) - 2, 0))
-    rate = np.column_stack([np.interp(at, t, column) for column in w.T])
-    integral = area[k] + (w[k] + rate) / 2 * (at - t[k])[:, None]
-    rows = zip(pairwise(at), pairwise(integral), strict=True)
-    mean = [rate[0], *((after - before) / (end - begin) for (begin, end), (before, after) in rows)]
-    return list(zip(kept, mean, strict=True))
+    t, at = ((np.asarray(times) - t_ns[0]) * 1e-9 for times in (t_ns, kept))
+    rate = make_interp_spline(t, w, k=min(len(t) - 1, 1))
+    mean = np.diff(rate.antiderivative()(at), axis=0) / np.diff(at)[:, None]
+    return list(zip(kept, [rate(at[0]), *mean], strict=True))

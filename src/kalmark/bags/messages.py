@@ -116,14 +116,14 @@ class Message:
 NO_ROTATION = "quaternion has length 0, expected 1"
 
 
-def frame_of(position: Any, rotation: Any) -> Array:
-    """Return the frame (7,) of a position and a quaternion, which is normalised.  Raises Refused."""
-    return np.append([position.x, position.y, position.z], unit(rotation))
+def frame_of(position: Any, rotation: Any, error: type[Exception] = Refused) -> Array:
+    """Return the frame (7,) of a position and a quaternion, which is normalised.  Raises `error`."""
+    return np.append([position.x, position.y, position.z], unit(rotation, error))
 
 
-def unit(rotation: Any) -> Array:
-    """Return a geometry_msgs/Quaternion (4,), normalised.  Raises Refused."""
-    return unit_quaternion(np.array([rotation.x, rotation.y, rotation.z, rotation.w]), Refused)
+def unit(rotation: Any, error: type[Exception] = Refused) -> Array:
+    """Return a geometry_msgs/Quaternion (4,), normalised.  Raises `error`."""
+    return unit_quaternion(np.array([rotation.x, rotation.y, rotation.z, rotation.w]), error)
 
 
 def pose_frame(pose: Any) -> Array:

@@ -16,14 +16,16 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.bags import messages
 from kalmark.bags.bag_opening import Bag, header_time
 from kalmark.declare import Within
 from kalmark.errors import LogError
-from kalmark.events import Control, Event, Scan, sort_key, unit_quaternion
+from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import exp, matrix
+from kalmark.logs.increments import increment_between
 from kalmark.logs.known_map import TAG, KnownLandmark
 from kalmark.logs.log import LandmarkPlaces, Log, Section, Trajectory
 from kalmark.logs.source import (
@@ -213,16 +215,15 @@ def find_bag(folder: Path, name: str) -> Path | None:
     return None
 
 
+def recorded_frame(pose: Any) -> Array:
+    """Return the frame (7,) of a geometry_msgs/Pose.  Raises LogError."""
+    return messages.frame_of(pose.position, pose.orientation, LogError)
+
+
 def messages_of_bag(path: Path) -> Messages:
     """Return (topic, message) of everything in a bag, as recorded.  Raises LogError if it cannot be read."""
     with Bag(path) as bag:
         return [(received.topic, received.message) for received in bag.messages(bag.topics)]
-
-
-def pose_of(position: Any, rotation: Any) -> Array:
-    """Return the frame (7,) of a position and a quaternion, which is normalised."""
-    q = unit_quaternion(np.array([rotation.x, rotation.y, rotation.z, rotation.w]), LogError)
-    return np.append([position.x, position.y, position.z], q)
 
 
 # ------------------------------------------------------------------ TagSLAM's own result
@@ -248,13 +249,13 @@ def read_reference(folder: Path, scene: TagSetup, rig: str) -> Reference:
     track: list[tuple[int, Array]] = []
     for topic, message in messages_of_bag(bag):
         if topic == f"/tagslam/odom/body_{moving}":
-            track.append((header_time(message), pose_of(message.pose.pose.position, message.pose.pose.orientation)))
+            track.append((header_time(message), recorded_frame(message.pose.pose)))
         elif topic == "/tf":
             for one in message.transforms:
-                pose = pose_of(one.transform.translation, one.transform.rotation)
-                last[one.header.frame_id, one.child_frame_id] = pose
+                frame = messages.frame_of(one.transform.translation, one.transform.rotation, LogError)
+                last[one.header.frame_id, one.child_frame_id] = frame
     if world != "map":
-        track = [(t_ns, frame_between(pose, last["map", rig])) for t_ns, pose in track]
+        track = [(t_ns, compose(inverse(pose)[0], last["map", rig])[0]) for t_ns, pose in track]
     tags: LandmarkPlaces = {
         int(child.removeprefix("tag_")): pose if parent == world else compose(last["map", parent], pose)[0]
         for (parent, child), pose in last.items()
@@ -263,11 +264,6 @@ def read_reference(folder: Path, scene: TagSetup, rig: str) -> Reference:
     cameras = {child: pose for (parent, child), pose in last.items() if parent == rig and not child.startswith("tag_")}
     path = Trajectory(*map(np.array, zip(*track, strict=True))) if track else None
     return Reference(path, tags, cameras)
-
-
-def frame_between(a: Array, b: Array) -> Array:
-    """Return the frame b in the frame a."""
-    return compose(inverse(a)[0], b)[0]
 
 
 # ------------------------------------------------------------------ odometry
@@ -285,7 +281,7 @@ def read_odometry(scene: TagSetup, received: Messages) -> Odometry | None:
     for body in scene.odometry.values():
         rows = [(header_time(m), m.pose.pose) for topic, m in received if topic == body["odom_topic"]]
         if rows:
-            poses = np.array([pose_of(pose.position, pose.orientation) for _, pose in rows])
+            poses = np.array([recorded_frame(pose) for _, pose in rows])
             sigmas = (float(body.get(f"odom_{what}_noise", SIGMA)) for what in ("translation", "rotation"))
             return Odometry(Trajectory(np.array([t for t, _ in rows]), poses), frame_of(body["T_body_odom"]), *sigmas)
     return None
@@ -296,12 +292,9 @@ def rig_increments(moved: Odometry, scans: Sequence[Scan]) -> list[Control]:
 
     The odometry's frame O moves by D in its own frame, the rig by T D T^-1.  The noise grows with the time.
     """
-    from scipy.spatial.transform import Rotation
-
     t_ns = np.unique([scan.t_ns for scan in scans])
     rig = [compose(pose, inverse(moved.T)[0])[0] for pose in moved.path.at(t_ns, max_gap_s=1e9)]
-    steps = np.array([frame_between(*pair) for pair in pairwise(rig)]).reshape(-1, 7)
-    u = np.column_stack([steps[:, :3], Rotation.from_quat(steps[:, 3:]).as_rotvec()])
+    u = [increment_between(*pair) for pair in pairwise(rig)]
     N = np.diag(np.square(3 * [moved.sigma_m] + 3 * [moved.sigma_rad]))
     covs = N * (np.diff(t_ns) * 1e-9)[:, None, None]
     return [Control(t_ns=int(t), robot=ROBOT, u=d, cov=cov) for t, d, cov in zip(t_ns[1:], u, covs, strict=True)]

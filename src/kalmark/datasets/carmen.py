@@ -18,6 +18,7 @@ the left end is left out.  Messages without a time, as older logs have them, are
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from kalmark.arrays import Array
 from kalmark.datasets.text_logs import STEP_NS, begins_with
 from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
-from kalmark.geometry.angles import wrap
+from kalmark.logs.increments import increment_between
 from kalmark.logs.log import Log, Section
 from kalmark.logs.source import (
     Format,
@@ -114,14 +115,8 @@ class _CarmenReader:
     def events(self) -> list[Event]:
         """Return the increments of the odometry and the scans."""
         events: list[Event] = []
-        before: Array | None = None
-        for t_ns, here in sorted(self.odometry.items()):
-            if before is not None:
-                c, s = math.cos(before[2]), math.sin(before[2])
-                x, y = here[:2] - before[:2]
-                u = (c * x + s * y, c * y - s * x, wrap(here[2] - before[2]))
-                events.append(Control(t_ns=t_ns, robot=ROBOT, u=u))
-            before = here
+        for (_, before), (t_ns, here) in pairwise(sorted(self.odometry.items())):
+            events.append(Control(t_ns=t_ns, robot=ROBOT, u=increment_between(before, here)))
         for (sensor, t_ns), beams in self.scans.items():
             events.append(Scan(t_ns=t_ns, robot=ROBOT, sensor=sensor, y=beams if len(beams) else ()))
         return events

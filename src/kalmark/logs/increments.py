@@ -18,8 +18,10 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.events import Control, Event, Scan, sort_key
-from kalmark.geometry.angles import V, V_inverse
+from kalmark.geometry.angles import V, V_inverse, wrap
+from kalmark.geometry.frames3d import compose, inverse
 from kalmark.geometry.rotations import left_jacobian, left_jacobian_inverse
+from kalmark.geometry.rotations import log as rotation_vector
 from kalmark.logs.log import Log, Names
 from kalmark.logs.table_columns import INCREMENT2, INCREMENT3, WHEELS
 
@@ -80,6 +82,16 @@ def unevenness(a: float, b: float) -> float:
     The motion has a step of 1 in its rate at any time within, all equally likely.
     """
     return (b - a) ** 2 * (a**3 + (1 - b) ** 3) / (3 * (1 - (b - a)))
+
+
+def increment_between(a: Array, b: Array) -> Array:
+    """Return the increment, (3,) in the plane or (6,) in space, that leads from the pose a (3,) or (7,) to b."""
+    if len(a) == 7:
+        step = compose(inverse(a)[0], b)[0]
+        return np.append(step[:3], rotation_vector(step[3:]))
+    c, s = np.cos(a[2]), np.sin(a[2])
+    x, y = b[:2] - a[:2]
+    return np.array([c * x + s * y, c * y - s * x, wrap(b[2] - a[2])])
 
 
 def part_of(u: Array, columns: Names, share: float) -> Array:
