@@ -37,7 +37,7 @@ def tried(
         y = e + rng.normal(0.0, 0.2, e.shape)
         ids = list(range(len(points)))
         beginning.add(km.Scan(k / 30, "camera", "eye", y, ids), [], dict(zip(ids, y, strict=True)), wrong)
-        begun = beginning.tried(cv2, CAMERA, PRIOR)
+        begun = beginning.tried(CAMERA, PRIOR)
         if begun is not None:
             return begun
     return None

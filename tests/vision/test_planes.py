@@ -45,20 +45,18 @@ def test_matches_show_a_slanted_wall_and_its_points_do_not_move_once_it_is_known
     renderer, rng = Renderer([slanted()], CAMERA), np.random.default_rng(0)
     path = [pose(0.04 * k, 0.01 * k, 0, 0, -k, 0) for k in range(16)]
     images = [renderer.taken(T, rng, noise=1.0, blur_px=0.7)[0] for T in path]
-    y = Cells(cv2, 12, 6, 4.0).corners(images[0], np.zeros((0, 2)), 60, 14, 1, np.random.default_rng(1))
-    views: list[list[View]] = [
-        [view] for view in (take_view(cv2, images[0], one, path[0], CAMERA, 12) for one in y) if view
-    ]
+    y = Cells(12, 6, 4.0).corners(images[0], np.zeros((0, 2)), 60, 14, 1, np.random.default_rng(1))
+    views: list[list[View]] = [[view] for view in (take_view(images[0], one, path[0], CAMERA, 12) for one in y) if view]
     rays = CAMERA.rays(y)
     places = rays * (MIDDLE @ NORMAL / (rays @ NORMAL))[:, None]
     last = {}
     for learns in (False, True):
         planes = [Plane(view.rays[4]) for (view,) in views]
         for T, image in zip(path[1:], images[1:], strict=True):
-            looks = predict_templates(cv2, views, [*planes], places, T, CAMERA, 6)
+            looks = predict_templates(views, [*planes], places, T, CAMERA, 6)
             e = CAMERA.expect(to_frame_many(T, places)[0])[0]
             some = looks.valid[np.isfinite(e[looks.valid]).all(axis=1)]
-            found, scores = Searcher(cv2, image, looks.templates, 0.85).in_discs(some, e[some], np.full(len(some), 4.0))
+            found, scores = Searcher(image, looks.templates, 0.85).in_discs(some, e[some], np.full(len(some), 4.0))
             for k, at, score in zip(some.tolist(), found, scores, strict=True):
                 if learns and score >= 0.85:
                     plane_from_match(image, looks.templates[k], at, planes[k].slopes, looks.rates[k], planes[k])
@@ -94,7 +92,7 @@ def test_a_depth_image_shows_the_plane_with_the_noise_it_says_and_none_at_an_edg
 def test_a_corner_is_in_the_middle_of_its_patch() -> None:
     image = np.full((100, 100), 50, np.uint8)
     image[52:, 47:] = 200
-    (found,) = Cells(cv2, 1, 6, 4.0).corners(image, np.zeros((0, 2)), 1, 14, 1, np.random.default_rng(2))
+    (found,) = Cells(1, 6, 4.0).corners(image, np.zeros((0, 2)), 1, 14, 1, np.random.default_rng(2))
     assert np.abs(found - [46.5, 51.5]).max() <= 1.5
 
 

@@ -169,7 +169,7 @@ def test_distances_of_a_segment_have_the_covariance_of_its_own_ends() -> None:
 def test_a_profile_is_that_across_the_segment_from_its_dark_side() -> None:
     image = np.full((60, 80), 50, np.uint8)
     image[30:] = 200
-    across = profiles(cv2, image, np.array([[10.0, 29.5, 70.0, 29.5], [70.0, 29.5, 10.0, 29.5]]))
+    across = profiles(image, np.array([[10.0, 29.5, 70.0, 29.5], [70.0, 29.5, 10.0, 29.5]]))
     assert across.shape == (2, 2 * REACH_PX + 1)
     assert across[0] @ across[1] == pytest.approx(-1.0)
     assert (across[0, :REACH_PX] < 0).all()
@@ -228,7 +228,7 @@ def test_a_sensor_takes_the_images_of_a_camera_with_its_intrinsics_and_mount(
     assert log.events[1].grey().shape == log.events[0].grey().shape
     assert not np.array_equal(log.events[1].grey(), log.events[0].grey())  # it is straightened
     decode = Mock(side_effect=cv2.imdecode)
-    monkeypatch.setattr(cv2, "imdecode", decode)
+    monkeypatch.setattr("imdecode", decode)
     for frame in log.events:
         frame.grey()
     assert decode.call_count == 2  # each once for both; the first one above

@@ -65,17 +65,17 @@ def test_a_patch_is_found_to_a_tenth_of_a_pixel_where_it_appears_from_elsewhere(
     image = renderer.taken(first, rng, noise=1.0, blur_px=0.7)[0]
     now = renderer.taken(then, rng, noise=1.0, blur_px=0.7)[0]
     y = corners(image, 40)
-    views = [[take_view(cv2, image, one, first, camera, 12)] for one in y]
+    views = [[take_view(image, one, first, camera, 12)] for one in y]
     places = places_of(camera, first, y)
     facing = [Surroundings(view.rays[4]) for (view,) in views]
-    looks = predict_templates(cv2, views, facing, places, then, camera, 6)
+    looks = predict_templates(views, facing, places, then, camera, 6)
     true = pixels(camera, then, places)
     inside = looks.valid[((true > 25) & (true < np.array(now.shape[::-1]) - 25))[looks.valid].all(axis=1)]
     assert len(inside) > 12
     radius = 12.0 if large else 4.0
     e = true[inside] + rng.uniform(-radius / 2, radius / 2, (len(inside), 2))
     Z = np.tile(np.eye(2) * (radius / 3) ** 2, (len(inside), 1, 1))
-    found, scores = Searcher(cv2, now, looks.templates, ACCEPT).in_ellipses(inside, e, Z, 9.0)
+    found, scores = Searcher(now, looks.templates, ACCEPT).in_ellipses(inside, e, Z, 9.0)
     good = scores >= ACCEPT
     off = np.linalg.norm(found - true[inside], axis=1)[good]
     assert good.mean() > 0.8
@@ -451,17 +451,17 @@ def test_the_right_image_of_a_pair_measures_disparities_and_what_it_does_not_sho
     landmark = km.landmarks.Homogeneous(prior_rho_per_m=0.5, sigma_rho_per_m=0.25)
     e = true_e[:k] + np.array([0, 0, 2.0, 0])  # of the known ones the disparity is expected 2 px off
     Z = np.tile(np.diag([1.0, 1.0, 4.0, 1.0]), (k, 1, 1))
-    out, R = with_pairs(cv2, PAIR, landmark, (image, right), y, e, Z, 6, ACCEPT)
+    out, R = with_pairs(PAIR, landmark, (image, right), y, e, Z, 6, ACCEPT)
     good = R[:, 2, 2] < 1.0
     assert good.mean() > 0.8
     assert np.median(np.abs(out - true_e)[good], axis=0).max() < 0.15
     assert np.abs(out - true_e)[good].max() < 1.0
-    alone, R = with_pairs(cv2, PAIR, landmark, (image, None), y, e, Z, 6, ACCEPT)
+    alone, R = with_pairs(PAIR, landmark, (image, None), y, e, Z, 6, ACCEPT)
     assert np.array_equal(alone[:, :2], y)
     assert (R[:k, 2, 2] == 1e6).all()
     ray, _ = PAIR.invert(alone[k:])
     assert ray[:, 3] == pytest.approx(0.5)  # the prior of the distance
-    bare, _ = with_pairs(cv2, PAIR, km.landmarks.Point3D(), (image, None), y, e, Z, 6, ACCEPT)
+    bare, _ = with_pairs(PAIR, km.landmarks.Point3D(), (image, None), y, e, Z, 6, ACCEPT)
     assert np.isnan(bare[:, 2]).tolist() == [False] * k + [True] * (len(y) - k)
 
 

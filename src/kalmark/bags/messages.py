@@ -225,7 +225,7 @@ def camera(m: Any) -> Section:
 # ------------------------------------------------------------------ images
 def image(m: Any) -> Any:
     """Return a sensor_msgs/Image in grey values (H, W).  Raises OSError."""
-    import cv2
+    from kalmark.vision import opencv as cv2
 
     encodings = {
         "mono8": (np.uint8, 1, None), "8UC1": (np.uint8, 1, None), "mono16": (np.uint16, 1, None),
@@ -253,7 +253,7 @@ def image(m: Any) -> Any:
 
 def compressed_image(m: Any) -> Any:
     """Return a sensor_msgs/CompressedImage in grey values (H, W).  Raises OSError."""
-    import cv2
+    from kalmark.vision import opencv as cv2
 
     data = np.frombuffer(np.ascontiguousarray(m.data).tobytes(), dtype=np.uint8)
     decoded = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None

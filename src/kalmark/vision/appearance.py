@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from kalmark.arrays import Array, Index
 from kalmark.geometry.rotations import matrix
+from kalmark.vision import opencv as cv2
 from kalmark.vision.planes import Plane
 
 MOST_SCALE = 2.0  # a patch is not enlarged or reduced by more
@@ -56,7 +57,7 @@ def patch_corners(y: Array, q: float) -> Array:
     return y + q * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [0.0, 0.0]])
 
 
-def take_view(cv2: Any, image: Any, y: Array, T: Array, sensor: Any, q: int, frame: int = 0) -> View | None:
+def take_view(image: Any, y: Array, T: Array, sensor: Any, q: int, frame: int = 0) -> View | None:
     """Return the view of what is at the pixel y (2,) of an image taken from T, None too near to its border."""
     height, width = image.shape
     if not (q <= y[0] <= width - 1 - q and q <= y[1] <= height - 1 - q):
@@ -86,7 +87,7 @@ def best_views(views: list[list[View]], places: Array, T: Array) -> tuple[list[V
 
 
 def predict_templates(
-    cv2: Any, views: list[list[View]], planes: list[Plane | None], places: Array, T: Array, sensor: Any, h: int
+    views: list[list[View]], planes: list[Plane | None], places: Array, T: Array, sensor: Any, h: int
 ) -> ExpectedAppearance:  # fmt: skip
     """Return the expected templates of landmarks at `places` (K, 3) from T, of half width h."""
     best, likeness = best_views(views, places, T)

@@ -9,9 +9,10 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.declare import Positive, register
-from kalmark.errors import EventError, ModelError
+from kalmark.errors import EventError
 from kalmark.events import Frame, Raw, Scan, label_of_event
 from kalmark.models.sensors import TagCorners
+from kalmark.vision import opencv as cv2
 
 Family = Literal["16h5", "25h9", "36h10", "36h11"]
 
@@ -19,11 +20,7 @@ Family = Literal["16h5", "25h9", "36h10", "36h11"]
 @lru_cache(maxsize=8)
 def _detector(family: str) -> Any:
     """Return OpenCV's detector of a family, its corners refined to a fraction of a pixel."""
-    try:
-        import cv2
-    except ImportError:
-        raise ModelError("Tags: OpenCV is not installed, expected it: pip install 'kalmark[opencv]'") from None
-    aruco: Any = cv2.aruco
+    aruco = cv2.aruco
     parameters = aruco.DetectorParameters()
     parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
     return aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, f"DICT_APRILTAG_{family}")), parameters)

@@ -22,6 +22,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.events import Id, Scan
 from kalmark.geometry.rotations import conjugate, exp, from_matrix, left_jacobian, log, matrix, multiply, skew
 from kalmark.slam.sources import BufferedScans
+from kalmark.vision import opencv as cv2
 
 FIRST, LATER, LAST = 8, 1.4, 250  # frames: the first attempt, how much later the next one is, the last one
 FRAMES, FEWEST = 8, 12  # that are fitted, spread over all; landmarks that must be left
@@ -56,7 +57,7 @@ class Beginning:
         self.poses.append(T.copy())
         self.matched.append(fitted)
 
-    def tried(self, cv2: Any, sensor: Any, prior: float) -> BufferedScans | None:
+    def tried(self, sensor: Any, prior: float) -> BufferedScans | None:
         """Return the start of the map, once determined; the median of its inverse distances is the `prior`, 1/m."""
         k = len(self.scans) - 1
         if self.over or k < self.next:
@@ -71,7 +72,7 @@ class Beginning:
         y = np.array([[self.matched[j].get(name, nowhere) for name in left] for j in some])
         rays = sensor.invert(np.array([self.matched[0][name] for name in left]))[0]
         rays /= np.linalg.norm(rays, axis=1)[:, None]
-        fit = self._sure(cv2, sensor, rays, y, some, prior)
+        fit = self._sure(sensor, rays, y, some, prior)
         if fit is None:
             return None
         rho = np.maximum(fit.rho / np.median(fit.rho), LEAST_RHO) * prior
@@ -83,16 +84,14 @@ class Beginning:
         """Keep no more frames."""
         self.over, self.scans, self.poses, self.matched = True, [], [], []
 
-    def _sure(
-        self, cv2: Any, sensor: Any, rays: Array, y: Array, some: list[int], prior: float
-    ) -> Reconstruction | None:
+    def _sure(self, sensor: Any, rays: Array, y: Array, some: list[int], prior: float) -> Reconstruction | None:
         """Return the fit to y (F, N, 2) if the landmarks are seen under some parallax and none other is as good."""
         first = self.poses[0]
         back = matrix(first[3:]).T
         w = np.array([log(multiply(conjugate(first[3:]), self.poses[j][3:])) for j in some])
         t = np.array([back @ (self.poses[j][:3] - first[:3]) for j in some])
         starts = [(w, t, np.full(len(rays), prior))]
-        of_last = solve_essential_matrix(cv2, sensor, rays, y[-1], prior)
+        of_last = solve_essential_matrix(sensor, rays, y[-1], prior)
         if of_last is not None:
             share = np.array(some)[:, None] / some[-1]
             starts.append((of_last[0] * share, of_last[1] * share, of_last[2]))
@@ -109,9 +108,7 @@ class Beginning:
         return best if same or other.cost - best.cost > SURE * best.variance else None
 
 
-def solve_essential_matrix(
-    cv2: Any, sensor: Any, rays: Array, y: Array, prior: float
-) -> tuple[Array, Array, Array] | None:
+def solve_essential_matrix(sensor: Any, rays: Array, y: Array, prior: float) -> tuple[Array, Array, Array] | None:
     """Return w (3,), t (3,), rho (N,) by the essential matrix of unit rays (N, 3) and pixels y (N, 2), or None."""
     seen = np.isfinite(y[:, 0])
     now = sensor.invert(y[seen])[0]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from kalmark.errors import KalmarkError
 from kalmark.events import Frame
 from kalmark.logs.log import Log
+from kalmark.vision import opencv as cv2
 
 if TYPE_CHECKING:
     from kalmark.results.history import Camera, History
@@ -47,8 +48,6 @@ class CameraImages:
         image = self.at(camera, step, side)
         if image is None:
             return ""
-        import cv2
-
         scale = min(1.0, WIDEST_PX / math.sqrt(len(self.history.cameras)) / image.shape[1])
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
         packed = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.vision import opencv as cv2
 
 BLOCK = 5  # px: surroundings of a corner, small so that it is in the middle of its patch
 FORGIVEN = 15  # frames until a cell in which no corner was found is looked at again
@@ -17,8 +18,8 @@ class Cells:
 
     failed: dict[tuple[int, int], int]
 
-    def __init__(self, cv2: Any, across: int, half: int, contrast: float) -> None:
-        self.cv2, self.across, self.half, self.contrast, self.failed = cv2, across, half, contrast, {}
+    def __init__(self, across: int, half: int, contrast: float) -> None:
+        self.across, self.half, self.contrast, self.failed = across, half, contrast, {}
 
     def corners(
         self, image: Any, taken: Array, count: int, margin: int, frame: int, random: np.random.Generator
@@ -55,14 +56,14 @@ class Cells:
         """Return the pixel of a part of the image whose surroundings differ most from any near it."""
         h = self.half
         part = image[top - h : bottom + h, left - h : right + h]
-        response = responses(self.cv2, part)[h:-h, h:-h]
+        response = responses(part)[h:-h, h:-h]
         j, i = divmod(int(response.argmax()), response.shape[1])
         if not response[j, i] >= self.contrast**2:
             return None
         return float(left + i), float(top + j)
 
 
-def responses(cv2: Any, image: Any) -> Any:
+def responses(image: Any) -> Any:
     """Return for each pixel of an image (H, W) the mean square of the gradient around it, where that is least.
 
     Of all directions, over a square of `BLOCK` pixels: in (grey values a pixel)^2.

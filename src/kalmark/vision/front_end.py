@@ -23,12 +23,12 @@ from kalmark.models.protocols import UnknownDepth, finds_depth, has_second_camer
 from kalmark.models.sensors import PinHole, PixelDepth, Stereo
 from kalmark.report import Report
 from kalmark.slam.sources import BufferedScans, FilterView, Found
+from kalmark.vision import opencv as cv2
 from kalmark.vision.appearance import ANOTHER_COSINE, ANOTHER_SCALE, MOST_VIEWS, View, predict_templates, take_view
 from kalmark.vision.beginning import Beginning
 from kalmark.vision.depth_images import inverse_depths, with_depths
 from kalmark.vision.features import FORGIVEN, Cells
 from kalmark.vision.joint_expectation import PIXEL, Prospect, places_of
-from kalmark.vision.opencv import opencv
 from kalmark.vision.pairs import with_pairs
 from kalmark.vision.planes import Plane, plane_from_depths, plane_from_match
 from kalmark.vision.recognition import match_expected, recognize_place
@@ -98,11 +98,12 @@ class FrontEnd:
     is_lost: bool
 
     def __init__(self, settings: ActiveSearch, sensor: Any) -> None:
-        self.settings, self.sensor, self.cv2 = settings, sensor, opencv()
+        self.settings, self.sensor = settings, sensor
+        cv2.setNumThreads(1)
         self.random = np.random.default_rng(settings.seed)
         width = sensor.image[0]
         across = max(4, round(np.sqrt(1.6 * settings.in_view * width / sensor.image[1])))
-        self.cells = Cells(self.cv2, across, TEMPLATE, settings.contrast)
+        self.cells = Cells(across, TEMPLATE, settings.contrast)
         self.looks, self.frame, self.named, self.is_lost = {}, 0, 0, False
         self.beginning = Beginning() if isinstance(sensor, PinHole) else None
         self.selection: Selection | None = None
@@ -135,22 +136,20 @@ class FrontEnd:
         places = places_of(view.map, view.tracks, view.channel, known)
         here = np.flatnonzero(np.isfinite(places).all(axis=1))
         views = [self.looks[known[k]].views for k in here.tolist()]
-        found = recognize_place(self.cv2, data[0], views, places[here], view.channel.calibrated(view.map))
+        found = recognize_place(data[0], views, places[here], view.channel.calibrated(view.map))
         return None if found is None else (found.T, found.cov)
 
     def found(self, raw: Raw, data: tuple[Any, Any], view: FilterView) -> Found:
         """Search an image for the landmarks in view, and for new ones."""
         prospect, (image, beside) = Prospect(view.map, view.tracks, view.channel, view.robot), data
-        settings, cv2 = self.settings, self.cv2
+        settings = self.settings
         self.frame += 1
         self.image, self.prospect = image, prospect
         views = [self._views(name) for name in prospect.names]
         planes = [self.looks[name].plane if name in self.looks else None for name in prospect.names]
-        looks = self.likely = predict_templates(
-            cv2, views, planes, prospect.places, prospect.T, prospect.sensor, TEMPLATE
-        )
+        looks = self.likely = predict_templates(views, planes, prospect.places, prospect.T, prospect.sensor, TEMPLATE)
         self.beside = beside if isinstance(self.sensor, PixelDepth) else None
-        searcher = Searcher(cv2, image, looks.templates, settings.accept)
+        searcher = Searcher(image, looks.templates, settings.accept)
         search, drifted = ImageSearch(prospect, looks.valid, searcher, settings.updates), None
         found = self.selection = search.run(self.random)
         again = self._matched_again(image, prospect, searcher)
@@ -220,7 +219,7 @@ class FrontEnd:
         """Return, once, the start of the map, if the first frames determine it; the median of rho is the prior."""
         if self.beginning is None or not isinstance(landmark, UnknownDepth) or landmark.prior_rho_per_m <= 0.0:
             return None
-        found = self.beginning.tried(self.cv2, self.sensor, landmark.prior_rho_per_m)
+        found = self.beginning.tried(self.sensor, landmark.prior_rho_per_m)
         if self.beginning.over:
             self.beginning = None
         return found
@@ -250,7 +249,7 @@ class FrontEnd:
 
     # ------------------------------------------------------------------ landmarks
     def _taken(self, y: Array, T: Array) -> View | None:
-        return take_view(self.cv2, self.image, y, T, self.sensor, PATCH, self.frame - 1)
+        return take_view(self.image, y, T, self.sensor, PATCH, self.frame - 1)
 
     def _plane(self, y: Array, view: View) -> Plane:
         """Return the plane about the pixel y (2,) of a first view."""
@@ -285,7 +284,7 @@ class FrontEnd:
         if len(old) < ENOUGH or found.matched[old].sum() > len(old) / 2:
             return None
         views = [self._views(prospect.names[k]) for k in old.tolist()]
-        return match_expected(self.cv2, image, views, old, prospect, searcher)
+        return match_expected(image, views, old, prospect, searcher)
 
     def _first_look(self, image: Any, prospect: Prospect, found: Selection) -> None:
         """Enter where landmarks known beforehand are that have no view yet; not in each frame, as it takes long."""
@@ -293,7 +292,7 @@ class FrontEnd:
             return
         rows = [k for k, name in enumerate(prospect.names) if name in self.looks and not self.looks[name].views]
         if rows:
-            first = FirstLook(self.cv2, image, prospect, self.settings.contrast)
+            first = FirstLook(image, prospect, self.settings.contrast)
             for k, y in first.found(found.belief, rows).items():
                 found.matched[k], found.y[k] = True, y
 
@@ -314,7 +313,7 @@ class FrontEnd:
         Z = prospect.whole_innovations(found.belief, np.array(rows, dtype=np.int64))
         if isinstance(sensor, Stereo):
             images = self.image, beside
-            return with_pairs(self.cv2, sensor, landmark, images, y, e, Z, TEMPLATE, self.settings.accept)
+            return with_pairs(sensor, landmark, images, y, e, Z, TEMPLATE, self.settings.accept)
         rho = np.full(len(y), np.nan) if beside is None else inverse_depths(beside, y, sensor.sigma_rho_per_m)
         return with_depths(sensor, landmark, y, rho, e[:, 2], Z[:, 2, 2])
 

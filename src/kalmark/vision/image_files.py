@@ -16,6 +16,7 @@ from kalmark.arrays import Array
 from kalmark.errors import ImageError, LogError
 from kalmark.events import Frame
 from kalmark.logs.source import Request
+from kalmark.vision import opencv as cv2
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp")
 TRAILERS = {b"\x89PN": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
@@ -24,29 +25,18 @@ TAIL = 64  # bytes at the end of a file in which its trailer is: some cameras pa
 DEPTH_SCALE = 5000.0  # of TUM RGB-D: a depth of 1 m is 5000
 
 
-def opencv(path: Path) -> Any:
-    """Return OpenCV.  Raises LogError if it is not installed."""
-    try:
-        import cv2
-    except ImportError:
-        raise LogError(
-            f"{path}: images need the library OpenCV, expected it installed: `pip install 'kalmark[opencv]'`"
-        ) from None
-    return cv2
-
-
 def image_of(path: Path) -> Any:
     """Return an image file in grey values (H, W).  Raises OSError if it cannot be decoded."""
-    return _decoded(path, opencv(path).IMREAD_GRAYSCALE)
+    return _decoded(path, cv2.IMREAD_GRAYSCALE)
 
 
 def depth_of(path: Path, scale: float) -> Array:
     """Return an image file of depths in m (H, W): its numbers over `scale`.  Raises OSError if it cannot be decoded."""
-    return np.asarray(_decoded(path, opencv(path).IMREAD_UNCHANGED), dtype=np.float64) / scale
+    return np.asarray(_decoded(path, cv2.IMREAD_UNCHANGED), dtype=np.float64) / scale
 
 
 def _decoded(path: Path, flag: int) -> Any:
-    image = opencv(path).imdecode(np.fromfile(path, dtype=np.uint8), flag)
+    image = cv2.imdecode(np.fromfile(path, dtype=np.uint8), flag)
     if image is None:
         raise OSError(f"{path}: cannot be decoded, expected an image")
     return image
@@ -109,7 +99,7 @@ def frames_of(
 
 def write_image(path: Path, image: Any) -> None:
     """Write an image (H, W) or (H, W, 3) of bytes as PNG."""
-    path.write_bytes(opencv(path).imencode(".png", image)[1].tobytes())
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
 def write_depth(path: Path, depth: Array) -> None:
@@ -170,7 +160,6 @@ class Forward:
 
 def video_images(path: Path) -> Iterator[Any]:
     """Yield the images of a video in grey values (H, W)."""
-    cv2 = opencv(path)
     video = cv2.VideoCapture(str(path))
     try:
         while True:
@@ -184,7 +173,6 @@ def video_images(path: Path) -> Iterator[Any]:
 
 def video_facts(path: Path) -> tuple[int, float]:
     """Return the number of images and the rate [Hz] that a video states, 0 if it does not.  Raises LogError."""
-    cv2 = opencv(path)
     with warnings.catch_warnings():
         video = cv2.VideoCapture(str(path))
         count, rate = int(video.get(cv2.CAP_PROP_FRAME_COUNT)), float(video.get(cv2.CAP_PROP_FPS))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.report import Report
+from kalmark.vision import opencv as cv2
 from kalmark.vision.front_end import FrontEnd
 from kalmark.vision.joint_expectation import PIXEL
 from kalmark.vision.segments import LineFrontEnd
@@ -35,7 +36,6 @@ def overlay(front_end: FrontEnd | LineFrontEnd, report: Report, scale: int = 1) 
     >>> km.vision.overlay(slam.state.sources["hand", "eye"], report, scale=2).shape
     (960, 1280, 3)
     """
-    cv2 = front_end.cv2
     size = (front_end.image.shape[1] * scale, front_end.image.shape[0] * scale)
     picture = cv2.cvtColor(cv2.resize(front_end.image, size), cv2.COLOR_GRAY2BGR)
 
@@ -51,7 +51,7 @@ def overlay(front_end: FrontEnd | LineFrontEnd, report: Report, scale: int = 1) 
         for segment, colour in drawn:
             cv2.line(picture, place(segment[:2]), place(segment[2:]), colour, scale, cv2.LINE_AA, 4)
         return picture
-    _ellipses(cv2, picture, front_end.selection, place, scale)
+    _ellipses(picture, front_end.selection, place, scale)
     for o in report.observations:
         radius, filled = (4 * scale * FINE, 1) if o.outcome == "new" else (2 * scale * FINE, -1)
         colour = COLOURS.get(o.outcome, REJECTED)
@@ -59,7 +59,7 @@ def overlay(front_end: FrontEnd | LineFrontEnd, report: Report, scale: int = 1) 
     return picture
 
 
-def _ellipses(cv2: Any, picture: Any, found: Selection | None, place: Callable[[Any], tuple[int, int]], scale: int
+def _ellipses(picture: Any, found: Selection | None, place: Callable[[Any], tuple[int, int]], scale: int
 ) -> None:  # fmt: skip
     """Draw where landmarks were searched."""
     for k in np.flatnonzero(np.isfinite(found.regions).all(axis=(1, 2))).tolist() if found is not None else ():

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array, Flags
+from kalmark.vision import opencv as cv2
 from kalmark.vision.depth_images import DepthPrior
 from kalmark.vision.selection import GATE
 from kalmark.vision.template_matching import Searcher
@@ -23,7 +24,7 @@ SIGMAS = 3.0  # of the prior of the inverse distance that are searched
 WIDEST = 0.25  # of the width of the image: disparities that are searched for a landmark without a prior
 
 
-def patches(cv2: Any, image: Any, y: Array, half: int) -> Any:
+def patches(image: Any, y: Array, half: int) -> Any:
     """Return the patches about the pixels y (n, 2) of an image, (n, 2 half + 1, 2 half + 1)."""
     side = 2 * half + 1
     found = [cv2.getRectSubPix(image, (side, side), (float(u), float(v))) for u, v in y]
@@ -31,7 +32,7 @@ def patches(cv2: Any, image: Any, y: Array, half: int) -> Any:
 
 
 def with_pairs(
-    cv2: Any, sensor: Any, landmark: Any, images: tuple[Any, Any | None], y: Array, e: Array, Z: Array, half: int,
+    sensor: Any, landmark: Any, images: tuple[Any, Any | None], y: Array, e: Array, Z: Array, half: int,
     accept: float,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Return measurements (n, 4) of left pixels y (n, 2), NaN where none is possible, and their noise (n, 4, 4).
@@ -49,7 +50,7 @@ def with_pairs(
     middle[k:], sigma[k:] = most / 2, most / 2 / np.sqrt(GATE)
     right, found = np.full((len(y), 2), np.nan), np.zeros(len(y), np.bool_)
     if images[1] is not None and len(y):
-        right, found = match_pair(cv2, (images[0], images[1]), y, middle, sigma, sensor.sigma_vr_px, k, half, accept)
+        right, found = match_pair((images[0], images[1]), y, middle, sigma, sensor.sigma_vr_px, k, half, accept)
     out = np.column_stack([y, np.where(found[:, None], right, y)])
     R = np.array(sensor.noise(out), dtype=np.float64)
     off = np.flatnonzero(~found)
@@ -66,7 +67,7 @@ def with_pairs(
 
 
 def match_pair(
-    cv2: Any, images: tuple[Any, Any], y: Array, middle: Array, sigma: Array, sigma_v: float, k: int, half: int,
+    images: tuple[Any, Any], y: Array, middle: Array, sigma: Array, sigma_v: float, k: int, half: int,
     accept: float,
 ) -> tuple[Array, Flags]:  # fmt: skip
     """Return the pixels (n, 2) of the right image that match pixels y (n, 2) of the left one, and which match (n,).
@@ -76,11 +77,11 @@ def match_pair(
     which, shift = np.arange(len(y)), np.column_stack([middle, np.zeros(len(y))])
     Z = np.zeros((len(y), 2, 2))
     Z[:, 0, 0], Z[:, 1, 1] = np.square(sigma), 2.0 * sigma_v**2
-    searcher = Searcher(cv2, images[1], patches(cv2, images[0], y, half), accept)
+    searcher = Searcher(images[1], patches(images[0], y, half), accept)
     right, scores = searcher.in_ellipses(which, y - shift, Z, GATE)
     found = (scores >= accept) & (right[:, 0] <= y[:, 0])
     new = np.flatnonzero(found & (which >= k))
-    searcher = Searcher(cv2, images[0], patches(cv2, images[1], right[new], half), accept)
+    searcher = Searcher(images[0], patches(images[1], right[new], half), accept)
     back, scores = searcher.in_ellipses(np.arange(len(new)), right[new] + shift[new], Z[new], GATE)
     found[new] = (scores >= accept) & (np.abs(back - y[new]).max(axis=1, initial=0.0) < BACK_PX)
     return right, found

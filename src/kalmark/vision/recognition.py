@@ -16,6 +16,7 @@ import numpy as np
 from kalmark.arrays import Array, Index
 from kalmark.geometry.frames3d import to_frame_many
 from kalmark.geometry.rotations import from_matrix
+from kalmark.vision import opencv as cv2
 from kalmark.vision.appearance import View
 from kalmark.vision.joint_expectation import PIXEL, Prospect
 from kalmark.vision.template_matching import Searcher
@@ -40,13 +41,13 @@ class Recognised(NamedTuple):
 
 
 def match_expected(
-    cv2: Any, image: Any, views: Sequence[Sequence[View]], old: Index, prospect: Prospect, searcher: Searcher
+    image: Any, views: Sequence[Sequence[View]], old: Index, prospect: Prospect, searcher: Searcher
 ) -> tuple[Index, Array] | None:
     """Return landmarks (n,) of a prospect and the pixels (n, 2) where an image shows them; None if that is ambiguous.
 
     `old` (k,) are the landmarks of these views.
     """
-    found = recognize_place(cv2, image, views, prospect.places[old], prospect.sensor)
+    found = recognize_place(image, views, prospect.places[old], prospect.sensor)
     if found is None:
         return None
     rows = old[found.which]
@@ -56,13 +57,11 @@ def match_expected(
     return (rows[good], y[good]) if good.sum() >= LEAST else None
 
 
-def recognize_place(
-    cv2: Any, image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any
-) -> Recognised | None:
+def recognize_place(image: Any, views: Sequence[Sequence[View]], places: Array, sensor: Any) -> Recognised | None:
     """Return the pose from which an image (H, W) of landmarks at `places` (K, 3) was taken; None if it is ambiguous."""
     orb = cv2.ORB_create(CORNERS, nlevels=1, edgeThreshold=REACH + 1, patchSize=2 * REACH + 1)
-    known, owner = describe_views(cv2, orb, views)
-    seen, y = describe_corners(cv2, orb, image)
+    known, owner = describe_views(orb, views)
+    seen, y = describe_corners(orb, image)
     landmark, corner = pairs(known, owner, seen)
     rays = sensor.rays(y[corner]) if len(corner) else np.zeros((0, 3))
     ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.1)
@@ -87,31 +86,31 @@ def recognize_place(
     return Recognised(np.concatenate([at, from_matrix(np.ascontiguousarray(R))]), cov, landmark[agree])
 
 
-def describe_views(cv2: Any, orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any, Index]:
+def describe_views(orb: Any, views: Sequence[Sequence[View]]) -> tuple[Any, Index]:
     """Return the bits (N, 256) that describe all views, and the number (N,) of the landmark of each."""
     bits, owner = [np.zeros((0, 256), np.float32)], list[int]()
     for k, patch in ((k, view.patch) for k, own in enumerate(views) for view in own):
         wide = cv2.copyMakeBorder(patch, MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_REPLICATE)
-        some, _ = describe_pixels(cv2, orb, wide, np.array([[wide.shape[1] // 2, wide.shape[0] // 2]]))
+        some, _ = describe_pixels(orb, wide, np.array([[wide.shape[1] // 2, wide.shape[0] // 2]]))
         bits.append(some)
         owner += [k] * len(some)
     return np.concatenate(bits), np.array(owner, dtype=np.int64)
 
 
-def describe_corners(cv2: Any, orb: Any, image: Any) -> tuple[Any, Array]:
+def describe_corners(orb: Any, image: Any) -> tuple[Any, Array]:
     """Return the bits (M, 256) that describe the corners of an image, and their pixels (M, 2)."""
     bits, pixels = [np.zeros((0, 256), np.float32)], [np.zeros((0, 2))]
     for size in SIZES:
         small = image if size == 1.0 else cv2.resize(image, None, fx=size, fy=size, interpolation=cv2.INTER_AREA)
         corners = cv2.goodFeaturesToTrack(small, CORNERS, QUALITY, APART_PX)
         y = np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
-        some, which = describe_pixels(cv2, orb, small, y)
+        some, which = describe_pixels(orb, small, y)
         bits.append(some)
         pixels.append((y[which] + 0.5) / size - 0.5)
     return np.concatenate(bits), np.concatenate(pixels)
 
 
-def describe_pixels(cv2: Any, orb: Any, image: Any, y: Array) -> tuple[Any, Index]:
+def describe_pixels(orb: Any, image: Any, y: Array) -> tuple[Any, Index]:
     """Return the bits (M, 256) that describe what is about the pixels y (N, 2), and which of them they are of (M,).
 
     It is turned as the grey values lie: from the pixel towards their centre of mass.

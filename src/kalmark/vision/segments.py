@@ -22,7 +22,7 @@ from kalmark.models.sensors import Segments
 from kalmark.report import Expectations, Report
 from kalmark.slam.sources import FilterView, Found
 from kalmark.tracks.expecting import expectations
-from kalmark.vision.opencv import opencv
+from kalmark.vision import opencv as cv2
 from kalmark.vision.searches import TRIAL, Searches, make_room
 
 GATE = gate(0.99, 2)
@@ -89,11 +89,10 @@ class LineFrontEnd:
     named: int
 
     def __init__(self, settings: LineSearch, sensor: Any) -> None:
-        self.settings, self.sensor, self.cv2 = settings, sensor, opencv()
+        self.settings, self.sensor = settings, sensor
+        cv2.setNumThreads(1)
         width = sensor.image[0]
-        self.detector = self.cv2.createLineSegmentDetector(
-            self.cv2.LSD_REFINE_STD, HALVED if width >= WIDE_PX else FULL
-        )
+        self.detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD, HALVED if width >= WIDE_PX else FULL)
         self.looks, self.frame, self.named = {}, 0, 0
         self.expected: Expectations | None = None
         self.matches: Matches | None = None
@@ -112,7 +111,7 @@ class LineFrontEnd:
         image, expected = data, expectations(view.map, view.tracks, view.channel, view.robot, "", only_in_view=True)
         self.frame, self.image, self.expected = self.frame + 1, image, expected
         segments = self._detected(image)
-        across = profiles(self.cv2, image, segments)
+        across = profiles(image, segments)
         known = [self.looks.get(name) for name in expected.names]
         mine = np.array([np.zeros(across.shape[1]) if look is None or look.profile is None else look.profile
                          for look in known]).reshape(len(known), across.shape[1])  # fmt: skip
@@ -188,7 +187,7 @@ class LineFrontEnd:
         self.looks = {name: look for name, look in self.looks.items() if name in names}
 
 
-def profiles(cv2: Any, image: Any, segments: Array) -> Array:
+def profiles(image: Any, segments: Array) -> Array:
     """Return the grey values across segments (M, 4), means along them, of mean 0 and length 1: (M, 2 REACH_PX + 1)."""
     a, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
     normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]

@@ -9,7 +9,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.events import Frame
-from kalmark.vision.opencv import opencv
+from kalmark.vision import opencv as cv2
 
 
 class Straightened:
@@ -37,5 +37,4 @@ class Straightened:
 
     def of(self, frame: Frame) -> Any:
         """Return the straight image (H, W) of a frame, 0 where the camera does not see.  Raises ImageError."""
-        cv2 = opencv()
         return cv2.remap(frame.grey(), *self.maps, cv2.INTER_LINEAR)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.arrays import Array
+from kalmark.vision import opencv as cv2
 from kalmark.vision.features import responses
 from kalmark.vision.joint_expectation import Belief, Prospect
 from kalmark.vision.selection import GATE
@@ -26,9 +27,9 @@ APART = 4  # px: a corner is the strongest so far around
 class FirstLook:
     """An image (H, W) in which landmarks of a prospect are searched that no image has shown before."""
 
-    def __init__(self, cv2: Any, image: Any, prospect: Prospect, contrast: float) -> None:
+    def __init__(self, image: Any, prospect: Prospect, contrast: float) -> None:
         self.prospect = prospect
-        response = responses(cv2, image)
+        response = responses(image)
         top = cv2.dilate(response, np.ones((2 * APART + 1, 2 * APART + 1), np.uint8))
         v, u = np.nonzero((response == top) & (response >= contrast**2))
         order = np.argsort(-response[v, u], kind="stable")

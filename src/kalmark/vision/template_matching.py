@@ -13,6 +13,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.compiled import compiled
+from kalmark.vision import opencv as cv2
 
 COARSE_PX = 8.0  # an ellipse of larger radius is searched at half the resolution first
 COARSE_LESS = 0.15  # the score may be so much lower there
@@ -28,8 +29,8 @@ class Searcher:
     `accept` is the least score of a match.
     """
 
-    def __init__(self, cv2: Any, image: Any, templates: Any, accept: float) -> None:
-        self.cv2, self.image, self.templates, self.accept = cv2, np.ascontiguousarray(image), templates, accept
+    def __init__(self, image: Any, templates: Any, accept: float) -> None:
+        self.image, self.templates, self.accept = np.ascontiguousarray(image), templates, accept
         self._half: Any = None
 
     def in_ellipses(self, which: Index, e: Array, Z: Array, d2: float) -> tuple[Array, Array]:
@@ -56,8 +57,8 @@ class Searcher:
     def _coarse_to_fine(self, which: int, e: Array, Z: Array, d2: float, r: Array) -> tuple[Array, float]:
         """Search at half the resolution, then about the best places there."""
         if self._half is None:
-            self._half = self.cv2.pyrDown(self.image)
-        template = self.cv2.pyrDown(self.templates[which])
+            self._half = cv2.pyrDown(self.image)
+        template = cv2.pyrDown(self.templates[which])
         h, size = template.shape[0] // 2, np.array(self._half.shape[::-1])
         low = np.maximum(np.ceil(e / 2 - r / 2), h).astype(np.int64)
         end = np.minimum(np.floor(e / 2 + r / 2), size - 1 - h).astype(np.int64) + 1
@@ -65,7 +66,7 @@ class Searcher:
         if (low >= end).any():
             return best, most
         region = self._half[low[1] - h : end[1] + h, low[0] - h : end[0] + h]
-        scores = self.cv2.matchTemplate(region, template, self.cv2.TM_CCOEFF_NORMED)
+        scores = cv2.matchTemplate(region, template, cv2.TM_CCOEFF_NORMED)
         x, y = (2.0 * np.arange(first, stop) - at for first, stop, at in zip(low, end, e, strict=True))
         W = np.linalg.inv(Z)
         inside = W[0, 0] * x**2 + 2 * W[0, 1] * y[:, None] * x + W[1, 1] * (y**2)[:, None] <= d2
