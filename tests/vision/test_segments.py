@@ -228,7 +228,7 @@ def test_a_sensor_takes_the_images_of_a_camera_with_its_intrinsics_and_mount(
     assert log.events[1].grey().shape == log.events[0].grey().shape
     assert not np.array_equal(log.events[1].grey(), log.events[0].grey())  # it is straightened
     decode = Mock(side_effect=cv2.imdecode)
-    monkeypatch.setattr("imdecode", decode)
+    monkeypatch.setattr(cv2, "imdecode", decode)
     for frame in log.events:
         frame.grey()
     assert decode.call_count == 2  # each once for both; the first one above

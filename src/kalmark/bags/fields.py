@@ -23,7 +23,7 @@ from kalmark.errors import LogError
 from kalmark.events import short_text, unit_quaternion
 from kalmark.logs.log import Names
 from kalmark.logs.table import Refused
-from kalmark.logs.table_columns import CANONICAL, FACTORS, GLOBE, INERTIAL, POSE3, POSITION, TWIST3
+from kalmark.logs.table_columns import GLOBE, INERTIAL, POSE3, POSITION, TWIST3, in_order, in_own_unit
 
 ID = "id"
 OWN = (*POSE3, "theta_rad", *GLOBE, "v_mps", "steering_rad", "w_radps", *TWIST3, *INERTIAL)
@@ -55,19 +55,13 @@ class Fields:
             )
         paths = {}
         for name, path in given.items():
-            stem, _, unit = str(name).rpartition("_")
-            column, factor = (
-                (f"{stem}_{FACTORS[unit][0]}", FACTORS[unit][1])
-                if unit in FACTORS and name not in GLOBE
-                else (name, 1.0)
-            )
+            column, factor = (name, 1.0) if name in GLOBE else in_own_unit(str(name))
             if not scan and column not in OWN:
                 raise LogError(
                     f"{where}: fields has {short_text(name)}, expected some of {', '.join(dict.fromkeys(OWN))}"
                 )
             paths[column] = (path, factor)
-        order = [name for name in CANONICAL if name in paths]
-        return cls({name: paths[name] for name in (*order, *(name for name in paths if name not in order))})
+        return cls({name: paths[name] for name in in_order(paths)})
 
     def message(self, scan: bool) -> Message:
         """Return the contents of a message by these fields."""
@@ -214,8 +208,9 @@ def _place(paths: list[str]) -> dict[str, str]:
     places: dict[str, dict[str, str]] = {}
     for path in paths:
         above, _, _ = path.removesuffix("[]").rpartition(".")
-        if words_of_name(path) in (["x"], ["y"], ["z"], ["w"]):
-            places.setdefault(above, {})[f"{words_of_name(path)[0]}_m"] = path
+        axis, *more = words_of_name(path) or [""]
+        if axis in ("x", "y", "z", "w") and not more:
+            places.setdefault(above, {})[f"{axis}_m"] = path
     for above, found in places.items():
         if (
             {*POSITION[:2]} <= found.keys()
@@ -230,12 +225,9 @@ def _polar(paths: list[str]) -> dict[str, str]:
     """Return the fields of the range and the angles among numbers, {} if there are none."""
     found: dict[str, str] = {}
     for path in paths:
+        quantity, *units = words_of_name(path) or [""]
         for column, names in (("range_m", RANGE), ("bearing_rad", BEARING), ("elevation_rad", ELEVATION)):
-            if (
-                words_of_name(path)[:1] != []
-                and words_of_name(path)[0] in names
-                and {*words_of_name(path)[1:]} <= {"m", "rad"}
-            ):
+            if quantity in names and {*units} <= {"m", "rad"}:
                 found.setdefault(column, path)
     if "elevation_rad" in found and "bearing_rad" in found:
         found["azimuth_rad"] = found.pop("bearing_rad")

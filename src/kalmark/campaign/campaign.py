@@ -56,7 +56,7 @@ class Anees:
     `inside` leave out the first `skip` steps.
     """
 
-    def __init__(self, name: str, scores: Sequence[Scores], skip: int = 0, probability: float = 0.95) -> None:
+    def __init__(self, name: str, scores: Sequence[Scores], skip: int = 0) -> None:
         kind = name.removesuffix("_world")
         values, size = (np.array([s.series[key] for s in scores]) for key in (name, f"{kind}_dof"))
         finite = np.isfinite(values) & np.isfinite(size)
@@ -66,10 +66,9 @@ class Anees:
         over = dof if kind == "joint" else self.runs
         known = over > 0
         divisor, dof = np.where(known, over, 1.0), np.where(known, dof, 1.0)
-        tail = (1.0 - probability) / 2.0
         self.mean = np.where(known, np.where(finite, values, 0.0).sum(axis=0) / divisor, np.nan)
-        self.low = np.where(known, quantile(tail, dof) / divisor, np.nan)
-        self.high = np.where(known, quantile(1.0 - tail, dof) / divisor, np.nan)
+        self.low = np.where(known, quantile(0.025, dof) / divisor, np.nan)
+        self.high = np.where(known, quantile(0.975, dof) / divisor, np.nan)
         self.ideal = 1.0 if kind == "joint" else finite_mean(size[finite])
 
     @property

@@ -6,7 +6,7 @@ are the same whatever the number of workers.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -240,11 +240,7 @@ def results_of_plans(
 
 
 def results_of(
-    plans: Sequence[Plan],
-    tasks: Sequence[Task],
-    jobs: int | None = None,
-    backend: str = "loky",
-    address: str | None = None,
+    plans: Sequence[Plan], tasks: Sequence[Task], jobs: int | None, backend: str, address: str | None
 ) -> Iterator[tuple[Task, Result]]:
     """Yield the result of each task once, as they become ready.
 
@@ -260,7 +256,9 @@ def results_of(
             for cell, numbers in groups:
                 yield from zip(((cell, n) for n in numbers), plans[cell].some(numbers), strict=True)
             return
-        compile_engine(plans[cell] for cell, _ in groups)
+        batched = next((plans[cell] for cell, _ in groups if plans[cell].path == BATCHED), None)
+        if batched is not None:
+            next(batched.some((0,)))  # workers load what that has compiled
     left, tries = dict.fromkeys(tasks), 0
     while left:
         before = len(left)
@@ -280,14 +278,6 @@ def results_of(
                     f"campaign: workers died {TRIES} times ({type(error).__name__}), expected them to finish a run"
                 )
                 raise KalmarkError(message) from error
-
-
-def compile_engine(plans: Iterable[Plan]) -> None:
-    """Do a run of the first plan that the engine does: workers then load what that has compiled."""
-    for plan in plans:
-        if plan.path == BATCHED:
-            next(plan.some((0,)))
-            return
 
 
 def group_tasks(plans: Sequence[Plan], tasks: Sequence[Task]) -> list[Group]:

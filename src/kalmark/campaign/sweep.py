@@ -21,6 +21,7 @@ from kalmark.campaign.sweep_cells import Cell, value_as_yaml
 from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.figure_texts import Figures
+from kalmark.results.history import grouped
 from kalmark.results.measures import finite_mean
 from kalmark.results.run_page import figure_text, html_table, read_page, tagged
 from kalmark.results.scene import COLOURS
@@ -161,39 +162,28 @@ class Sweep:
         """
         from matplotlib.figure import Figure
 
-        rows = self.runs()
+        rows, first = self.runs(), self.campaigns[0]
         numeric = [k for k in self.keys if all(is_number(c.settings[k]) for c in self.cells)]
         along = (numeric or self.keys)[-1]
         values = [*dict.fromkeys(value_as_yaml(cell.settings[along]) for cell in self.cells)]
         at = {text: float(text) if numeric else float(i) for i, text in enumerate(values)}
-        curves: dict[str, list[Figures]] = {}
-        for row in rows:
-            others = [_setting(key, row[key]) for key in self.keys if key != along]
-            same = any(key.endswith("estimator.type") for key in self.keys)
-            curves.setdefault(", ".join(others + ([] if same else [row["estimator"]])), []).append(row)
+        curves = grouped(rows, lambda row: self._label(row, along))
         panels = [(key, label) for key, label in _PANELS if any(np.isfinite(row[key]) for row in rows)]
         figure = Figure(figsize=(9, 2.3 * len(panels) + 0.8), layout="constrained")
         axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (key, label) in zip(axes, panels, strict=True):
             for i, (name, mine) in enumerate(curves.items()):
-                there = [text for text in values if any(value_as_yaml(row[along]) == text for row in mine)]
-                told = [
-                    figure_over_runs(key, np.array([r[key] for r in mine if value_as_yaml(r[along]) == text]))
-                    for text in there
-                ]
-                middle, half = np.array(told).T
-                x = sorted(range(len(there)), key=lambda k, there=there: at[there[k]])  # type: ignore[misc]
-                where = [at[there[k]] for k in x]
-                axis.errorbar(where, middle[x], half[x], marker="o", markersize=4, capsize=3, linewidth=1.1,
+                points = grouped(mine, lambda row: at[value_as_yaml(row[along])])
+                told = [(x, *figure_over_runs(key, np.array([row[key] for row in points[x]]))) for x in sorted(points)]
+                axis.errorbar(*np.transpose(told), marker="o", markersize=4, capsize=3, linewidth=1.1,
                               color=COLOURS[i % len(COLOURS)], label=name or None)  # fmt: skip
             if key == "pose_nees":
-                axis.axhline(self.campaigns[0].ideal("pose"), color="0.4", linewidth=0.8, label="consistent")
+                axis.axhline(first.ideal("pose"), color="0.4", linewidth=0.8, label="consistent")
             axis.set_ylabel(label)
             axis.grid(visible=True, linewidth=0.3)
         axes[0].legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize="small", frameon=False)
         axes[-1].set_xlabel(along)
         axes[-1].set_xticks([*at.values()], values)
-        first = self.campaigns[0]
         figure.suptitle(f"{first.world}: {first.runs} runs a cell, seed {first.seed}; bars: 95 % intervals")
         replace_file(path, lambda temporary: figure.savefig(temporary, dpi=110))
 
@@ -214,6 +204,16 @@ class Sweep:
             of=" of the first cell" if self.keys else "",
         )  # fmt: skip
 
+    def _label(self, row: Figures, along: str) -> str:
+        """Return what the curve of a run is called: its settings but that `along` the axis, its estimator."""
+        words = []
+        for key in self.keys:
+            if key != along:
+                of = "" if key.endswith("estimator.type") else f"{key.rpartition('.')[2]} "
+                words.append(of + value_as_yaml(row[key]))
+        swept = any(key.endswith("estimator.type") for key in self.keys)
+        return ", ".join(words if swept else [*words, row["estimator"]])
+
     @property
     def _short(self) -> bool:
         """True if the last words of the keys differ."""
@@ -222,10 +222,3 @@ class Sweep:
 
 def _percent(key: str, value: Any) -> Any:
     return 100.0 * value if key.endswith("_inside") and value is not None else value
-
-
-def _setting(key: str, value: Any) -> str:
-    """Return a setting as a curve's label has it: the name of an estimator, or the key's last word and the value."""
-    return (
-        value_as_yaml(value) if key.endswith("estimator.type") else f"{key.rpartition('.')[2]} {value_as_yaml(value)}"
-    )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kalmark.cli.shared import (
+    OtherLog,
     Overrides,
     announce_compilation_elsewhere,
     cell_text,
@@ -43,7 +44,7 @@ def campaign(
             help="ekf, textbook, invariant:iterations=1, own_file:Class; may be given again. (default: the file's)"
         ),
     ] = None,
-    log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
+    log: OtherLog = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the campaign.")] = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes. (default: one a core)")] = None,
     backend: Annotated[Backend, typer.Option(help="Who runs the processes.")] = Backend.LOKY,

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
 HERE = "127.0.0.1"
-ENDS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+ENDS = [number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGHUP")]
 BUSY = 0.05  # of the time may be spent on saving
 
 
@@ -163,13 +163,7 @@ def _descriptor(stream: Any) -> int | None:
         return None
 
 
-def serve(
-    told: Live,
-    port: int,
-    silent_s: float = 60.0,
-    look: Callable[[], object] = lambda: None,
-    idle_s: float | None = None,
-) -> None:
+def serve(told: Live, port: int, silent_s: float, look: Callable[[], object], idle_s: float | None) -> None:
     """Answer one program after the other on a port of this machine, until the filter is lost.
 
     A connection is closed if it sends nothing for `silent_s` (0: no limit), reads no answers, or uses another protocol.

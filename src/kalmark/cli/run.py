@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, limit_blas_threads, print_summary, say, slam_of, writable
+from kalmark.cli.shared import (
+    ConfigName,
+    OtherLog,
+    Overrides,
+    limit_blas_threads,
+    print_summary,
+    say,
+    slam_of,
+    writable,
+)
 from kalmark.errors import KalmarkError, PluginError, RunError
 from kalmark.plugins import load
 
@@ -74,8 +83,8 @@ def refuse_other_log(folder: Path, path: str) -> None:
 
 
 def run(
-    config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
-    log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
+    config: ConfigName,
+    log: OtherLog = None,
     out: Annotated[Path | None, typer.Option(help="The run folder. (default: out/CONFIG, not of another log)")] = None,
     overrides: Overrides = None,
     on_error: Annotated[
@@ -114,7 +123,7 @@ def run(
 
 
 def warm_up(
-    config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
+    config: ConfigName,
     overrides: Overrides = None,
 ) -> None:
     """Compile beforehand all that runs of a configuration need."""

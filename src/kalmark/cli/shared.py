@@ -26,11 +26,14 @@ from kalmark.results.figure_texts import (
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
 
+ConfigName = Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")]
+OtherLog = Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="Override one key; may be given again.")
 ]
 Trust = Annotated[bool, typer.Option("--trust", help="Run the plug-ins that the config.yaml of RUN names.")]
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="The folder that `kalmark run` wrote.")]
+NO_NAMES = ("", "", "")  # of columns
 _SHOWN_IF_ANY = {"new", "ignored", "deferred", "tentative", "rejected", "fixes", "fixes_rejected"}
 
 
@@ -88,12 +91,33 @@ def print_summary(title: str, summary: Summary) -> None:
     from kalmark.results.self_calibration import ESTIMATE_COLUMNS, MOUNT_COLUMNS, estimate_rows, mount_rows
     from kalmark.results.verdict_text import verdict_lines
 
-    rows = [
+    totals = [
         (label, cell_text(summary[key], unit), unit)
         for key, label, unit in TOTALS
         if summary.get(key) is not None and (summary[key] or key not in _SHOWN_IF_ANY)
     ]
-    print_table(title, ("", "", ""), rows, align="<><")
+    print_table(title, NO_NAMES, totals, align="<><")
+    _print_robots(summary)
+    figures = {key: value for key, value in summary.get("batch", {}).items() if key != "pose_differences"}
+    compared = [(label, cell_text(value), unit) for _, label, value, unit in rows_with_labels(figures, BATCH)]
+    for name, columns, rows, align in (
+        ("mounts that calibrate themselves", MOUNT_COLUMNS, mount_rows(summary), "<<>>>"),
+        ("calibrations, estimated", ESTIMATE_COLUMNS, estimate_rows(summary), "<<>>"),
+        ("against the batch solution", NO_NAMES, compared, "<><"),
+        (DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, difference_rows(summary), "<>>>"),
+    ):
+        if rows:
+            print_table(name, columns, rows, align=align)
+    for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
+        for line in summary.get(key, ()):
+            say(f"{kind}: {line}")
+    verdict = summary.get("verdict")
+    for n, line in enumerate(verdict_lines(verdict) if verdict else ()):
+        say(f"{'  ' if n else 'verdict: '}{line}")
+
+
+def _print_robots(summary: Summary) -> None:
+    """Print a row of figures for each robot, and for each other program on the same log."""
     robots: Summary = summary.get("robots", {})
     shown = [(key, column_header(label, unit), unit) for key, label, unit in ROBOT]
     shown = [row for row in shown if any(figures.get(row[0]) is not None for figures in robots.values())]
@@ -107,25 +131,6 @@ def print_summary(title: str, summary: Summary) -> None:
             most = [figure(f["pose_nees_most"], 2) for f in robots.values() if f.get("pose_nees_most") is not None]
             this = f", up to {', '.join(most)} in this one" if most else ""
             say(f"consistent pose NEES: {summary.get('pose_dof', 3)} averaged over many runs{this}\n")
-    mounts = mount_rows(summary)
-    if mounts:
-        print_table("mounts that calibrate themselves", MOUNT_COLUMNS, mounts, align="<<>>>")
-    estimates = estimate_rows(summary)
-    if estimates:
-        print_table("calibrations, estimated", ESTIMATE_COLUMNS, estimates, align="<<>>")
-    batch: Summary = summary.get("batch", {})
-    if batch:
-        figures = {key: value for key, value in batch.items() if key != "pose_differences"}
-        compared = [(label, cell_text(v), unit) for _, label, v, unit in rows_with_labels(figures, BATCH)]
-        print_table("against the batch solution", ("", "", ""), compared, align="<><")
-        if differences := difference_rows(summary):
-            print_table(DIFFERENCE_TITLE.lower(), DIFFERENCE_COLUMNS, differences, align="<>>>")
-    for kind, key in (("warning", "warnings"), ("note", "notes"), ("advice", "advice")):
-        for line in summary.get(key, ()):
-            say(f"{kind}: {line}")
-    verdict = summary.get("verdict")
-    for n, line in enumerate(verdict_lines(verdict) if verdict else ()):
-        say(f"{'  ' if n else 'verdict: '}{line}")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, align: str) -> None:

@@ -21,8 +21,9 @@ from kalmark.errors import LogError, MapError, ModelError
 from kalmark.events import Raw
 from kalmark.geometry.named_poses import world_of
 from kalmark.logs.formats import known_formats
-from kalmark.logs.known_map import HIGH, KnownLandmark, read_known
+from kalmark.logs.known_map import KnownLandmark, read_known
 from kalmark.logs.log import Log
+from kalmark.logs.table_columns import POSITION
 from kalmark.models.inertial import Inertial, start_at_rest
 from kalmark.models.landmark_views import Raised
 from kalmark.models.landmarks import PointHeight2D
@@ -56,7 +57,7 @@ def build_slam(config: Config, log: Log | None = None, **given: Any) -> Slam:
     slam: Slam = made(("robots",), Slam, **made((), arguments_of, plain_section(config), robots=robots, **given))
     world = robots[0].motion.space.world
     for name, mean, cov, columns in _known(config, log):
-        high = PointHeight2D() if columns == HIGH and world == "plane" else None
+        high = PointHeight2D() if columns == POSITION and world == "plane" else None
         made(("map", "known"), slam.add_landmark, name, mean, cov, high)
     for k, known in enumerate(m.landmarks):
         at = ("map", "landmarks", str(k))

@@ -24,6 +24,7 @@ from kalmark.events import short_text
 from kalmark.files import refuse_aliases
 
 Plain = dict[str, Any]  # the values of a mapping in YAML
+Configuration = Mapping[str, Any]  # such values that are read, of a whole configuration
 KeyPath = tuple[str, ...]  # keys, from the whole configuration to one of its values
 EACH = "each"
 SHARED = ("robots", "sensors")  # the mappings whose entry `each` stands for all

@@ -18,7 +18,16 @@ from kalmark.errors import LogError
 from kalmark.events import Control, Event, Scan
 from kalmark.files import refuse_bomb
 from kalmark.logs.log import Log, PositionTrack, Times
-from kalmark.logs.source import Format, Request, folder_of, nanoseconds_of_text, one_robot, read_text, timed_rows
+from kalmark.logs.source import (
+    Format,
+    Request,
+    folder_of,
+    nanoseconds_of_text,
+    one_robot,
+    read_text,
+    text_rows,
+    timed_rows,
+)
 from kalmark.logs.table_columns import BEAM
 
 ROBOT, SENSOR = "car", "laser"
@@ -75,7 +84,7 @@ def ascii_text(path: Path, name: str, otherwise: str) -> tuple[Path, str]:
 def ascii_controls(path: Path, request: Request) -> list[Event]:
     """Return speed and steering of the ascii files (recalibrated), from DRS.txt or the zip that holds it."""
     file, text = ascii_text(path, ASCII_DR, "steering: mat")
-    table = timed_rows(file, ("v_mps", "steering_rad"), request.refuse, text)
+    table = timed_rows(file, ("v_mps", "steering_rad"), request.refuse, text_rows(file, text))
     return [Control(t_ns=t_ns + ASCII_BEHIND_NS, robot=ROBOT, u=u) for _, t_ns, u in table]
 
 

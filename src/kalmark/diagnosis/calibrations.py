@@ -10,12 +10,13 @@ from scipy.stats import norm
 
 from kalmark.arrays import Array
 from kalmark.batch.data import BatchInput
+from kalmark.config.tree import KeyPath
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
 from kalmark.diagnosis.error_columns import MOST_SCALE, Column, columns_of, rates_of, stacked
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.tunable_keys import Keys, Path_
+from kalmark.diagnosis.tunable_keys import Keys
 from kalmark.results.run import Run
 
 ALPHA = 0.01  # of right configurations of which anything is changed
@@ -23,8 +24,8 @@ KNOWN_TO = {"": MOST_SCALE, "m": 0.1}  # scales and places of mounts beforehand:
 
 
 def calibrations(
-    run: Run, linear: Linear, given: BatchInput, keys: Keys, sure: set[Path_]
-) -> tuple[list[Finding], dict[Path_, str]]:
+    run: Run, linear: Linear, given: BatchInput, keys: Keys, sure: set[KeyPath]
+) -> tuple[list[Finding], dict[KeyPath, str]]:
     """Return the calibrations that are off; the ones that the log cannot distinguish from another error name that.
 
     All systematic errors are estimated together, so that one that the log does not determine has a large sigma.

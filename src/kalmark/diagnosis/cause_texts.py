@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from kalmark.batch.motion_chain import TURNING
-from kalmark.config.tree import EACH, value_at
+from kalmark.config.tree import EACH, Configuration, value_at
 from kalmark.diagnosis.causes import TIMES, Finding
 from kalmark.diagnosis.error_columns import ALL, ALSO, DRIFT
 from kalmark.diagnosis.jumps import LISTED, OddControl, step_size
@@ -40,6 +40,11 @@ CALIBRATIONS = {  # the keys that put an error of a column of the controls into 
 SIGMAS = {f"d{name}": f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "theta_rad")}
 SIGMAS |= dict.fromkeys(("rx_rad", "ry_rad", "rz_rad"), "sigma_rotation_rad")
 SIGMAS |= dict.fromkeys(("left_rad", "right_rad"), "sigma_way_m_per_sqrt_m")
+MOVED = {
+    "kidnapped": "{robot} is moved by about {jump} at t={t_s} s, and its controls do not show it",
+    "odometry_jump": "{robot} moves by {jump} more than by its controls at t={t_s} s: it is bumped, its wheels slip, or"
+    " its odometry jumps",
+}
 LIMITS = {
     "v_mps": "max_speed_mps",
     "dx_m": "max_speed_mps",
@@ -48,7 +53,7 @@ LIMITS = {
 }
 
 
-def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
+def finding_text(finding: Finding, config: Configuration) -> Words:
     """Return a sentence about a finding, and the line that would cure it, "" if no key does.
 
     `config` is the configuration of the run: a new noise is given as a number where it states the old one.
@@ -64,10 +69,7 @@ def finding_text(finding: Finding, config: Mapping[str, Any]) -> Words:
 
 
 def _value(finding: Finding) -> str:
-    """Return a size with its unit."""
-    if finding.unit in ("rad", "rad/s", "rad/m"):
-        return f"{figure(math.degrees(finding.value))} {finding.unit.replace('rad', 'deg')}"
-    return f"{finding.value:+.2%}" if not finding.unit else f"{figure(finding.value)} {finding.unit}"
+    return _size(finding.value, finding.unit, "+")
 
 
 def _sure(finding: Finding) -> str:
@@ -79,7 +81,7 @@ def _sensor(finding: Finding) -> str:
     return f"{ALL} of {finding.of[0]}" if finding.of[1] == ALL else ".".join(finding.of[:2])
 
 
-def _in_log(finding: Finding, config: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+def _in_log(finding: Finding, config: Configuration) -> Iterator[tuple[str, ...]]:
     """Yield the columns of a finding as they are in the log, where a detector measures ranges, by robot and sensor."""
     robot, sensor, *columns = finding.of
     sections = _current(config, robot, "sensors") or {}
@@ -89,13 +91,14 @@ def _in_log(finding: Finding, config: Mapping[str, Any]) -> Iterator[tuple[str, 
     yield from ((*where, column) for column in ([RANGE] if raw else columns))
 
 
-def _size(value: float, unit: str) -> str:
+def _size(value: float, unit: str, sign: str = "") -> str:
+    """Return a quantity with its unit: angles in degrees, and what has no unit in per cent, with this sign."""
     if unit.startswith("rad"):
         return f"{figure(math.degrees(value))} {unit.replace('rad', 'deg')}"
-    return f"{value:.2%}" if not unit else f"{figure(value)} {unit}"
+    return f"{figure(value)} {unit}" if unit else f"{value:{sign}.2%}"
 
 
-def _current(config: Mapping[str, Any], robot: str, *path: str) -> Any:
+def _current(config: Configuration, robot: str, *path: str) -> Any:
     """Return a value of a robot's section, None where the configuration does not state it."""
     stated = (value_at(config, ("robots", name, *path)) for name in (robot, EACH))
     return next((value for value in stated if value is not None), None)
@@ -105,7 +108,7 @@ def _set(robot: str, path: str, value: float) -> str:
     return f"--set robots.{robot}.{path}={figure(value)}"
 
 
-def log_correction_line(config: Mapping[str, Any], option: str, path: tuple[str, ...], by: float) -> str:
+def log_correction_line(config: Configuration, option: str, path: tuple[str, ...], by: float) -> str:
     """Return the line that adds to the times of a sensor (`shift_s`), or multiplies a column (`factors`), of a log."""
     now = value_at(config, ("log", option, *path))
     neutral = 0.0 if option == "shift_s" else 1.0
@@ -113,7 +116,7 @@ def log_correction_line(config: Mapping[str, Any], option: str, path: tuple[str,
     return f"--set log.{option}.{'.'.join(path)}={figure(old + by if option == 'shift_s' else old * by, 6)}"
 
 
-def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _range_scale(finding: Finding, config: Configuration) -> Words:
     robot, sensor, column = finding.of[:3]
     evidence, by = _lengths(finding, ""), 1.0 + finding.value
     if column == RANGE and sensor != ALL:
@@ -126,7 +129,7 @@ def _range_scale(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, " ".join(log_correction_line(config, "factors", of, factor) for of in _in_log(finding, config))
 
 
-def _range_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _range_offset(finding: Finding, config: Configuration) -> Words:
     robot, sensor, column = finding.of[:3]
     bias = _current(config, robot, "sensors", sensor, "bias_m") or 0.0
     known = column == RANGE and sensor != ALL
@@ -139,7 +142,7 @@ def _lengths(finding: Finding, unit: str) -> str:
     return f"{lengths} of {_sensor(finding)} are {off}"
 
 
-def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _bearing_offset(finding: Finding, config: Configuration) -> Words:
     robot, cures = finding.of[0], []
     sensors = (_current(config, robot, "sensors") or {}) if finding.of[1] == ALL else finding.of[1:2]
     for sensor in () if "azimuth_rad" in finding.of else sensors:
@@ -148,7 +151,7 @@ def _bearing_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     return f"bearings of {_sensor(finding)} are off by {_value(finding)}{_sure(finding)}", " ".join(cures)
 
 
-def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _time_offset(finding: Finding, config: Configuration) -> Words:
     early, by = "later" if finding.value > 0 else "earlier", f"{figure(abs(finding.value))} s"
     if finding.unit == DRIFT:
         gains = "loses" if finding.value > 0 else "gains"
@@ -158,14 +161,14 @@ def _time_offset(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, log_correction_line(config, "shift_s", where, finding.value)
 
 
-def _mount_position(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _mount_position(finding: Finding, config: Configuration) -> Words:
     robot, sensor, column = finding.of
     now = _current(config, robot, "sensors", sensor, "mount", column) or 0.0
     evidence = f"{column} of the mount of {_sensor(finding)} is {figure(now + finding.value)}, not {figure(now)}"
     return f"{evidence}{_sure(finding)}", _set(robot, f"sensors.{sensor}.mount.{column}", now + finding.value)
 
 
-def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _odometry(finding: Finding, config: Configuration) -> Words:
     robot, column, kind = finding.of
     small = "small" if finding.value > 0 else "large"
     each = " for each metre driven" if kind == "per_way" else ""
@@ -175,7 +178,7 @@ def _odometry(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, _calibrated(finding, config) or f"correct {column} by {_value(finding)}{each}"
 
 
-def _calibrated(finding: Finding, config: Mapping[str, Any]) -> str:
+def _calibrated(finding: Finding, config: Configuration) -> str:
     """Return the lines that take an error of controls out of a configuration or log, "" if no key does."""
     robot, column, kind = finding.of
     key = CALIBRATIONS.get((column, kind))
@@ -188,7 +191,7 @@ def _calibrated(finding: Finding, config: Mapping[str, Any]) -> str:
     return " ".join(log_correction_line(config, "factors", (robot, wheel), by) for wheel in wheels)
 
 
-def _noise(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _noise(finding: Finding, config: Configuration) -> Words:
     robot, *of = finding.of
     if finding.name == "start":
         if finding.at is not None:
@@ -211,11 +214,11 @@ def _sigma_of(column: str) -> str:
     return SIGMAS.get(column) or ("sigma_px" if column.endswith("_px") else f"sigma_{column}")
 
 
-def _offset(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _offset(finding: Finding, config: Configuration) -> Words:
     return f"{finding.name} of {'.'.join(finding.of)} is {_value(finding)}{_sure(finding)}", ""
 
 
-def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _correlated(finding: Finding, config: Configuration) -> Words:
     factor = math.sqrt(max((1.0 + finding.value) / (1.0 - finding.value), 1.0))
     evidence = (
         f"errors of {_sensor(finding)} {finding.of[2]} are correlated between observations (correlation"
@@ -225,13 +228,13 @@ def _correlated(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, ""
 
 
-def _moving(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _moving(finding: Finding, config: Configuration) -> Words:
     far = f", {figure(finding.moved_m)} m while it was seen" if finding.moved_m is not None else ""
     evidence = f"landmark {finding.of[0]} moves at {_value(finding)}{_sure(finding)}{far}: its place is wrong"
     return evidence, f"leave out {finding.of[0]}"
 
 
-def _landmark_prior(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _landmark_prior(finding: Finding, config: Configuration) -> Words:
     name = finding.of[0]
     at = ", ".join(figure(float(x)) for x in (np.zeros(0) if finding.at is None else finding.at))
     evidence = (
@@ -241,7 +244,7 @@ def _landmark_prior(finding: Finding, config: Mapping[str, Any]) -> Words:
     return evidence, f"correct {name} in the file of the survey, or leave it out"
 
 
-def _outliers(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _outliers(finding: Finding, config: Configuration) -> Words:
     return f"{finding.value:.1%} of the observations are far off where their landmark is", ""
 
 
@@ -257,14 +260,9 @@ def _others(times: Sequence[str]) -> str:
     return f"; {len(times)} more at t={some} s{', ...' if len(times) > LISTED else ''}" if times else ""
 
 
-def _kidnapped(finding: Finding, config: Mapping[str, Any]) -> Words:
-    far = f"{finding.of[0]} is moved by about {_jump(finding)} at t={finding.of[1]} s"
-    return f"{far}, and its controls do not show it{_others(finding.of[2:])}", ""
-
-
-def _odometry_jump(finding: Finding, config: Mapping[str, Any]) -> Words:
-    by = f"{finding.of[0]} moves by {_jump(finding)} more than by its controls at t={finding.of[1]} s"
-    return f"{by}: it is bumped, its wheels slip, or its odometry jumps{_others(finding.of[2:])}", ""
+def _moved(finding: Finding, config: Configuration) -> Words:
+    robot, t_s, *others = finding.of
+    return MOVED[finding.name].format(robot=robot, jump=_jump(finding), t_s=t_s) + _others(others), ""
 
 
 def odd_control_text(robot: str, odd: OddControl, times: Sequence[str] = ()) -> Words:
@@ -282,11 +280,11 @@ def odd_control_text(robot: str, odd: OddControl, times: Sequence[str] = ()) -> 
     )
 
 
-def _mount(finding: Finding, config: Mapping[str, Any]) -> Words:
+def _mount(finding: Finding, config: Configuration) -> Words:
     return f"the sensor {_sensor(finding)} is turned by {_value(finding)}{_sure(finding)}", ""
 
 
-_TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
+_TELL: dict[str, Callable[[Finding, Configuration], Words]] = {
     "range_scale": _range_scale,
     "range_offset": _range_offset,
     "bearing_offset": _bearing_offset,
@@ -300,8 +298,7 @@ _TELL: dict[str, Callable[[Finding, Mapping[str, Any]], Words]] = {
     "moving_landmark": _moving,
     "landmark_prior": _landmark_prior,
     "outliers": _outliers,
-    "kidnapped": _kidnapped,
-    "odometry_jump": _odometry_jump,
+    **dict.fromkeys(MOVED, _moved),
     "start": _noise,
     "mount": _mount,
 }

@@ -7,7 +7,7 @@ constant is put into the map with a sigma as large as the innovations: the filte
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import compress
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from kalmark.arrays import Array
-from kalmark.config.tree import robot_section, value_at
+from kalmark.config.tree import Configuration, robot_section, value_at
 from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.diagnosis.causes import LEAST_GAIN
 from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, with_value
@@ -95,7 +95,7 @@ class FilteredRun(NamedTuple):
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
 
 
-def filtered_with(trials: Trials, config: Mapping[str, Any], log: Log, events: list[Event]) -> FilteredRun | None:
+def filtered_with(trials: Trials, config: Configuration, log: Log, events: list[Event]) -> FilteredRun | None:
     """Return the fit of events under a configuration, None if they are refused."""
     run = trials.filter(config, log, events, shown=False)
     return None if run is None else fit_of_readings(run)
@@ -110,7 +110,7 @@ class _Sensor:
     """A sensor of the state, and the trials with it: events under a configuration, filtered as they are."""
 
     def __init__(
-        self, engine: Trials, as_it_is: FilteredRun, config: Mapping[str, Any], log: Log, events: list[Event], of: Where
+        self, engine: Trials, as_it_is: FilteredRun, config: Configuration, log: Log, events: list[Event], of: Where
     ) -> None:
         self.engine, self.as_it_is, self.config, self.log, self.events = engine, as_it_is, config, log, events
         self.where = of
@@ -127,14 +127,11 @@ class _Sensor:
         yield from self.signs()
         yield self.scale()
 
-    def key(self, name: str) -> str:
-        return f"robots.{self.where[0]}.sensors.{self.where[1]}.{name}"
-
     def cured(self, name: str, value: float) -> str:
-        return f"--set {self.key(name)}={figure(value)}"
+        return f"--set robots.{self.where[0]}.sensors.{self.where[1]}.{name}={figure(value)}"
 
     def trial(
-        self, name: str, config: Mapping[str, Any], told: Told, by: Array | None = None,
+        self, name: str, config: Configuration, told: Told, by: Array | None = None,
         change: Callable[[Array], Array] | None = None,
     ) -> Mistake | None:  # fmt: skip
         """Return a mistake with its gain, None where the log does not fit without it."""

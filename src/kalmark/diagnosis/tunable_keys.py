@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
-from kalmark.config.tree import EACH, put, robot_section, value_at
+from kalmark.config.tree import EACH, Configuration, KeyPath, Plain, put, robot_section, value_at
 from kalmark.diagnosis.components import Noise
 from kalmark.diagnosis.error_columns import Column
 from kalmark.results.run import Run
 
 CALIBRATIONS = {"range_scale": ("scale",), "range_offset": ("bias_m",), "bearing_offset": ("mount", "theta_rad")}
 
-Path_ = tuple[str, ...]
-Values = dict[Path_, Any]
+Values = dict[KeyPath, Any]
 
 
 class Keys:
@@ -25,10 +24,10 @@ class Keys:
     Those to `keep` are not offered.
     """
 
-    def __init__(self, config: dict[str, Any], written: Mapping[str, Any], keep: Collection[str] = ()) -> None:
+    def __init__(self, config: Plain, written: Configuration, keep: Collection[str] = ()) -> None:
         self.config, self.written, self.keep = config, written, {*keep}
 
-    def changed(self, values: Values) -> dict[str, Any]:
+    def changed(self, values: Values) -> Plain:
         """Return the configuration with other values of some keys."""
         content = deepcopy(self.config)
         for path, value in values.items():
@@ -36,7 +35,7 @@ class Keys:
                 put(content, owner, value)
         return content
 
-    def _owners(self, path: Path_) -> list[Path_]:
+    def _owners(self, path: KeyPath) -> list[KeyPath]:
         """Return the paths in the configuration in force of a key in the file."""
         robots = self.config["robots"]
         if path[0] != "robots" or path[1] in robots:
@@ -49,7 +48,7 @@ class Keys:
 
     def noises(self, run: Run) -> list[Noise]:
         """Return the noises of the configuration that may be estimated."""
-        found: dict[Path_, Noise] = {}
+        found: dict[KeyPath, Noise] = {}
         for path, names, value in self._keys(run):
             if not path[-1].startswith("sigma_") or "_bias_" in path[-1] or path[-1] == "sigma_scale":
                 continue
@@ -59,20 +58,20 @@ class Keys:
                 found[path] = Noise(path, robots, float(value), scale)
         return [*found.values()]
 
-    def _keys(self, run: Run) -> Iterator[tuple[Path_, tuple[str, ...], float]]:
+    def _keys(self, run: Run) -> Iterator[tuple[KeyPath, tuple[str, ...], float]]:
         """Yield the numbers of the models: path in the file, robots, value."""
-        robots: Mapping[str, Any] = self.config["robots"]
+        robots: Configuration = self.config["robots"]
         for name, robot in robots.items():
             names = tuple(n for n in run.final_slam().robots if n == name or (name == EACH and n not in robots))
             here = ("robots", self.section(name))
-            parts: list[tuple[Path_, Any]] = [((*here, "motion"), robot["motion"])]
+            parts: list[tuple[KeyPath, Any]] = [((*here, "motion"), robot["motion"])]
             parts += [((*here, "sensors", s), section) for s, section in robot["sensors"].items()]
             for path, section in parts if names else ():
                 for key, value in section.items():
                     if isinstance(value, float | int) and not isinstance(value, bool):
                         yield (*path, key), names, value
 
-    def _begin(self, run: Run, path: Path_) -> float:
+    def _begin(self, run: Run, path: KeyPath) -> float:
         """Return the value that a noise which is not stated is looked for from: that of a range may grow with it."""
         if path[-1] != "sigma_range_rel":
             return 0.0
@@ -81,12 +80,12 @@ class Keys:
         sigma = run.section(str(h.robot[h.step[mine][0]]), path[3]).get("sigma_range_m", 0.0) if mine.any() else 0.0
         return float(sigma / max(np.median(h.y[mine, 0]), 1e-3)) if mine.any() else 0.0
 
-    def calibration(self, run: Run, column: Column) -> Path_ | None:
+    def calibration(self, run: Run, column: Column) -> KeyPath | None:
         """Return the path of the key of a systematic error, None if it has none, or is in the map."""
         if column.name not in CALIBRATIONS:
             return None
         robot, sensor = column.of[:2]
-        path: Path_ = ("robots", self.section(robot_section(self.config, robot)), "sensors", sensor)
+        path: KeyPath = ("robots", self.section(robot_section(self.config, robot)), "sensors", sensor)
         section = run.section(robot, sensor)
         mount = section.get("mount") or {}
         in_map = any(section.get(key) for key in ("sigma_scale", "sigma_bias_m"))
@@ -95,6 +94,6 @@ class Keys:
         known = CALIBRATIONS[column.name][0] in section
         return path if known and not in_map and ".".join(path) not in self.keep else None
 
-    def stated(self, path: Path_) -> Any:
+    def stated(self, path: KeyPath) -> Any:
         """Return the value of a key as it is in force."""
         return value_at(self.config, self._owners(path)[0])

@@ -19,18 +19,18 @@ from scipy.stats import chi2, norm
 
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import LANDMARKS, Ints
-from kalmark.batch.data import replay_events
+from kalmark.batch.data import BatchInput, replay_events
 from kalmark.batch.solver import optimum
 from kalmark.config import build_slam, config_dict, open_run
 from kalmark.config.reading import config_of, resolve_config
-from kalmark.config.tree import Tree, read_tree
+from kalmark.config.tree import Configuration, KeyPath, Plain, Tree, read_tree
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import NEAR, apply_calibration, sensors_of
 from kalmark.diagnosis.calibrations import ALPHA, calibrations
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
 from kalmark.diagnosis.components import Components, Noise, NoiseEstimate
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.tunable_keys import Keys, Path_, Values
+from kalmark.diagnosis.tunable_keys import Keys, Values
 from kalmark.errors import KalmarkError
 from kalmark.logs.log import Log
 from kalmark.logs.progress import track
@@ -54,7 +54,7 @@ class Change(NamedTuple):
     tried.
     """
 
-    path: Path_
+    path: KeyPath
     before: Any
     after: Any
     sigma: float
@@ -125,7 +125,7 @@ def tune(
     return Task(config_dict(made), log, share, {*keep}, written_robots(config, overrides), progress).tuned(aim)
 
 
-def written_robots(config: str | Path, overrides: Sequence[str]) -> Mapping[str, Any]:
+def written_robots(config: str | Path, overrides: Sequence[str]) -> Configuration:
     """Return the section of robots as it stands in the file of a configuration, {} if it has none."""
     written = read_tree(resolve_config(config), overrides).values.get("robots")
     return written if isinstance(written, dict) else {}
@@ -148,14 +148,14 @@ class _Fit(NamedTuple):
     found: list[Finding]
     components: Components
     run: Run
-    alike: dict[Path_, str]
+    alike: dict[KeyPath, str]
 
 
 class Task:
     """A configuration and a log in two parts."""
 
     def __init__(
-        self, config: dict[str, Any], log: Log, share: float, keep: set[str], written: Mapping[str, Any], progress: bool
+        self, config: Plain, log: Log, share: float, keep: set[str], written: Configuration, progress: bool
     ) -> None:
         self.keys, self.log, self.progress = Keys(config, written, keep), log, progress
         times = [event.t_ns for event in log.events] or [0]
@@ -211,27 +211,30 @@ class Task:
         return value if association.get("type") == "identity" and isinstance(value, float) else None
 
     # ------------------------------------------------------------------ estimates
-    def fit(self, run: Run, values: Values, sure: set[Path_]) -> _Fit:
+    def fit(self, run: Run, values: Values, sure: set[KeyPath]) -> _Fit:
         """Return the estimates from a run over the first part, with these values."""
-        given = apply_calibration(run, batch_input(run))
-        problem = replay_events(given, self.first)
-        if not problem.factors:
-            raise KalmarkError("tune: no observation of the first part was of a landmark in the map")
-        linear = Linear.of(problem, optimum(problem, tolerance=NEAR).state)
+        noises = self.keys.noises(run)
+        given, linear = self._problem(run)
         found, alike = calibrations(run, linear, given, self.keys, sure)
         for finding in found:
             path, value = finding.of, finding.value
             values[path] = _remove_systematic_error(
                 path, self.keys.stated(path) if path not in values else values[path], value
             )
-        again = self.run(values, self.first) if found else run
         if found:
-            given = apply_calibration(again, batch_input(again))
-            problem = replay_events(given, self.first)
-            linear = Linear.of(problem, optimum(problem, tolerance=NEAR).state)
-        components = Components(given, self.first, linear.state, self.keys.noises(run))
+            run = self.run(values, self.first)
+            given, linear = self._problem(run)
+        components = Components(given, self.first, linear.state, noises)
         now = {n: values.get(n.path, n.stated) for n in components.noises}
-        return _Fit(components.fit(now), found, components, again, alike)
+        return _Fit(components.fit(now), found, components, run, alike)
+
+    def _problem(self, run: Run) -> tuple[BatchInput, Linear]:
+        """Return the data of a run over the first part, and their problem linear about its optimum."""
+        given = apply_calibration(run, batch_input(run))
+        problem = replay_events(given, self.first)
+        if not problem.factors:
+            raise KalmarkError("tune: no observation of the first part was of a landmark in the map")
+        return given, Linear.of(problem, optimum(problem, tolerance=NEAR).state)
 
     # ------------------------------------------------------------------ the whole
     def tuned(self, aim: str) -> Tuning:
@@ -253,16 +256,18 @@ class Task:
         if aim == MAP:
             changes = [_widened(change, wide) for change in changes]
             values |= {path: change.after for change in changes if (path := change.path) in wide}
-        changes += self._gate_change(values)
+        if GATE in values:
+            why = "as many observations are left out as before, with the smaller noise"
+            changes.append(Change(GATE, self.gate, values[GATE], 0.0, why))
         last = self.judged({c.path: c.after for c in changes if c.changed})
         windows = nis_windows(before.run.history), nis_windows(last.run.history)
         split_s = (self.split_ns - int(h.t_ns[0])) * 1e-9
         return Tuning(tuple(changes), base, self.scores(last, before), split_s, aim, rhos, factor, windows)
 
-    def _rounds(self) -> tuple[Values, _Fit, dict[Path_, float]]:
+    def _rounds(self) -> tuple[Values, _Fit, dict[KeyPath, float]]:
         """Return the values after rounds of filter and estimates, the last estimates and the sigmas of calibrations."""
         values: Values = {}
-        offsets: dict[Path_, float] = {}
+        offsets: dict[KeyPath, float] = {}
         for _ in track(range(ROUNDS), "filter and estimates", ROUNDS, show=self.progress):
             run = self.run(values | self._opened(values), self.first)
             fit = self.fit(run, values, {*offsets})
@@ -301,7 +306,7 @@ class Task:
                 break
         return {GATE: value} if value != self.gate else {}
 
-    def _changes(self, values: Values, fit: _Fit, offsets: dict[Path_, float]) -> list[Change]:
+    def _changes(self, values: Values, fit: _Fit, offsets: dict[KeyPath, float]) -> list[Change]:
         """Return of each key what it becomes: those that the first part does not determine stay as they are."""
         level = float(norm.isf(ALPHA / 2 / max(len(fit.noises), 1)))
         same = {
@@ -309,7 +314,7 @@ class Task:
             for noise, e in fit.noises.items()
             if noise.stated and e.determined and not e.bound and abs(math.log(e.value / noise.stated)) < level * e.sigma
         }
-        again = fit.components.fit(values_of(fit.noises), same) if same else fit.noises
+        again = fit.components.fit({noise: e.value for noise, e in fit.noises.items()}, same) if same else fit.noises
         changes = []
         for noise, old in fit.noises.items():
             e = old if noise in same else again[noise]
@@ -353,13 +358,7 @@ class Task:
             return {}, [c._replace(after=c.before, why=why) if c.changed else c for c in tried]
         return kept, tried
 
-    def _gate_change(self, values: Values) -> list[Change]:
-        if GATE not in values:
-            return []
-        why = "as many observations are left out as before, with the smaller noise"
-        return [Change(GATE, self.gate, values[GATE], 0.0, why)]
-
-    def _correlated(self, fit: _Fit, values: Values) -> tuple[dict[str, float], float, dict[Path_, float]]:
+    def _correlated(self, fit: _Fit, values: Values) -> tuple[dict[str, float], float, dict[KeyPath, float]]:
         """Return the correlations of errors, the factor of the map's sigmas by them, and those of the noises."""
         components = fit.components
         linear = components.linear(components.t_of({n: values.get(n.path, n.stated) for n in components.noises}))
@@ -368,7 +367,7 @@ class Task:
         t_s[linear.problem.nodes] = (given.t_ns - given.t_ns[:1].sum()) * 1e-9
         found = causes.correlations(linear, linear.simulated(causes.SETS), sensors, t_s)
         found = [f for f in found if f.p * len(found) < ALPHA and f.gain > LEAST_GAIN and f.value > 0]
-        wide: dict[Path_, float] = {}
+        wide: dict[KeyPath, float] = {}
         honest = linear
         for finding in found:
             honest = honest.scaled(finding.noise, 1.0)
@@ -394,18 +393,13 @@ class Task:
         return rhos, float(np.median(np.sqrt(two[some] / one[some]))) if some.any() else 1.0, wide
 
 
-def values_of(noises: Mapping[Noise, NoiseEstimate]) -> dict[Noise, float]:
-    """Return the values of some estimates."""
-    return {noise: estimate.value for noise, estimate in noises.items()}
-
-
-def _remove_systematic_error(path: Path_, value: float, s: float) -> float:
+def _remove_systematic_error(path: KeyPath, value: float, s: float) -> float:
     """Return a calibration with the systematic error s taken out."""
     kind = path[-1]
     return value * (1.0 + s) if kind == "scale" else value + s if kind == "bias_m" else value - s
 
 
-def _widened(change: Change, wide: Mapping[Path_, float]) -> Change:
+def _widened(change: Change, wide: Mapping[KeyPath, float]) -> Change:
     """Return the white noise with the information of the correlated one."""
     factor = wide.get(change.path)
     if factor is None or not change.after:

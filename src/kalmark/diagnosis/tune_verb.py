@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from kalmark.cli.shared import Overrides, cell_text, limit_blas_threads, print_table, say, writable
+from kalmark.cli.shared import (
+    ConfigName,
+    OtherLog,
+    Overrides,
+    cell_text,
+    limit_blas_threads,
+    print_table,
+    say,
+    writable,
+)
 from kalmark.errors import KalmarkError
 
 if TYPE_CHECKING:
@@ -24,8 +33,8 @@ class Aim(StrEnum):
 
 
 def tune(
-    config: Annotated[str, typer.Argument(metavar="CONFIG", help="A YAML file or a shipped name.")],
-    log: Annotated[Path | None, typer.Option(help="The log to use instead of the configuration's.")] = None,
+    config: ConfigName,
+    log: OtherLog = None,
     out: Annotated[Path | None, typer.Option(help="The file to write. (default: out/CONFIG_tuned.yaml)")] = None,
     share: Annotated[float, typer.Option(help="Part of the log to tune by; the rest judges.")] = 0.5,
     aim: Annotated[

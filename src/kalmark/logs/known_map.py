@@ -17,11 +17,11 @@ from kalmark.logs.geodesy import Globe
 from kalmark.logs.log import Names
 from kalmark.logs.source import Request, raise_refusal
 from kalmark.logs.table import Refused, Row, read_table
+from kalmark.logs.table_columns import POSE3, POSITION
 
-PLACES = ("x_m", "y_m", "z_m", "signature", "qx", "qy", "qz", "qw")
-HIGH = PLACES[:3]
-TAG = (*HIGH, *PLACES[4:])
-KINDS = {PLACES[:2], (*PLACES[:2], "signature"), HIGH, TAG}
+TAG = POSE3
+PLACES = (*POSITION, "signature", *POSE3[3:])
+KINDS = {POSITION[:2], (*POSITION[:2], "signature"), POSITION, TAG}
 
 
 class KnownLandmark(NamedTuple):

@@ -18,7 +18,7 @@ from kalmark.logs.log import Log, Names
 from kalmark.logs.native import FILES, LANDMARKS, RIG, TABLES
 from kalmark.logs.source import BETWEEN, landmark_id, names_of_text, nanoseconds_of_text
 from kalmark.logs.table import PARQUET, cov_columns
-from kalmark.logs.table_columns import CANONICAL, GPS, NAMES, POSE2, POSE3, POSITION
+from kalmark.logs.table_columns import GPS, NAMES, POSE2, POSE3, POSITION, in_order
 from kalmark.plugins import load
 
 Row = dict[str, Any]
@@ -77,9 +77,9 @@ def _fill(folder: Path, log: Log, parquet: bool) -> None:
 def header_of(rows: Sequence[Row]) -> list[str]:
     """Return the columns of a table: names, numbers in the order in which they are read back, noise."""
     names = dict.fromkeys(name for row in rows for name in row)
-    known = [name for name in (*NAMES, *CANONICAL) if name in names]
     noise = sorted(name for name in names if name.startswith("cov_"))
-    return [*known, *(name for name in names if name not in (*known, *noise)), *noise]
+    values = in_order(name for name in names if name not in (*NAMES, *noise))
+    return [*(name for name in NAMES if name in names), *values, *noise]
 
 
 def write_parquet(path: Path, header: Sequence[str], rows: Sequence[Row]) -> None:

@@ -111,7 +111,8 @@ def read_path(path: Path, request: Request) -> Trajectory:
 
 def tum_rows(path: Path, request: Request) -> Iterator[tuple[int, Array]]:
     """Yield times (ns), which increase, and poses (7,)."""
-    for line, t_ns, values in timed_rows(path, POSE3, request.refuse, plain_text(path, request), strictly=True):
+    rows = text_rows(path, plain_text(path, request))
+    for line, t_ns, values in timed_rows(path, POSE3, request.refuse, rows, strictly=True):
         try:
             yield t_ns, np.append(values[:3], unit_quaternion(np.array(values[3:]), ValueError))
         except ValueError as error:

@@ -270,12 +270,17 @@ def rows_in_time(
 
 
 def timed_rows(
-    path: Path, names: Names, refuse: Refuse, text: str | None = None, strictly: bool = False
-) -> Iterator[tuple[int, int, list[float]]]:
-    """Yield (line, t_ns, numbers) of rows `t_s, *names` of text, as `rows_in_time`; bad rows go to `refuse`."""
-    for line, t_ns, cells in rows_in_time(path, text_rows(path, text), refuse, strictly=strictly):
+    path: Path, names: Names, refuse: Refuse, rows: Iterable[tuple[int, list[str]]] | None = None, unit: str = "s",
+    strictly: bool = False,
+) -> Iterator[tuple[int, int, list[float]]]:  # fmt: skip
+    """Yield (line, t_ns, numbers) of rows of a time and `names`, as `rows_in_time`; bad rows go to `refuse`.
+
+    The rows are those of the text of the file, or given.
+    """
+    rows = text_rows(path) if rows is None else rows
+    for line, t_ns, cells in rows_in_time(path, rows, refuse, unit, strictly):
         if len(cells) != len(names):
-            columns = ", ".join(("t_s", *names))
+            columns = ", ".join((f"t_{unit}", *names))
             refuse(f"{path}:{line}: {len(cells) + 1} numbers in the row, expected {len(names) + 1}: {columns}")
             continue
         try:

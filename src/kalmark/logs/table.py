@@ -38,9 +38,7 @@ from kalmark.logs.source import (
     spelling_hint,
 )
 from kalmark.logs.table_columns import (
-    CANONICAL,
     DIRECTIONS,
-    FACTORS,
     GLOBE,
     NAMES,
     NOT_NEGATIVE,
@@ -48,6 +46,8 @@ from kalmark.logs.table_columns import (
     TIMES,
     UNITS,
     WHEELS,
+    in_order,
+    in_own_unit,
     in_unit_of,
     split_unit,
 )
@@ -61,7 +61,6 @@ SEPARATORS = {"\t": "tabs", "|": "'|'", " ": "blanks"}
 
 QUATERNION = POSE3[3:]
 
-_RANK = {name: rank for rank, name in enumerate(CANONICAL)}
 _COV = re.compile(r"cov_([0-9xyz])_?([0-9xyz])")
 
 
@@ -271,9 +270,10 @@ def read_table(
                 f"{where}: column {name!r} is unknown, expected "
                 f"{', '.join((*required, *allowed))}{spelling_hint(name, allowed)}"
             )
-    values.sort(key=lambda name: _RANK.get(name, len(_RANK)))
     index = {name: i for i, name in enumerate(header)}
-    return Table(Path(str(source)), index, tuple(values), noise, content, given, unit_ns, globe if on_globe else None)
+    return Table(
+        Path(str(source)), index, tuple(in_order(values)), noise, content, given, unit_ns, globe if on_globe else None
+    )
 
 
 def columns_in_plane(where: str, header: list[str], given: dict[str, tuple[str, float]]) -> list[str]:
@@ -298,14 +298,13 @@ def header_in_units(header: list[str], known: Names) -> tuple[list[str], dict[st
     """
     out, given, unit_ns = [], {}, TIMES["t_s"]
     for name in header:
-        stem, _, unit = name.rpartition("_")
-        meant = f"{stem}_{FACTORS[unit][0]}" if unit in FACTORS else ""
+        meant, factor = in_own_unit(name)
         if name in TIMES and "t_s" in known and name not in known:
             out.append("t_s")
             given["t_s"], unit_ns = (name, 1.0), TIMES[name]
         elif name not in known and meant.removeprefix("sigma_") in known:
             out.append(meant)
-            given[meant] = (name, FACTORS[unit][1])
+            given[meant] = (name, factor)
         else:
             out.append(name)
     return out, given, unit_ns

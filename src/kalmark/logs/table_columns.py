@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 
 POSITION = ("x_m", "y_m", "z_m")
 POSE2, POSE3 = (*POSITION[:2], "theta_rad"), (*POSITION, "qx", "qy", "qz", "qw")
@@ -54,6 +55,7 @@ FACTORS = {
 """Units of columns that are taken, too: each the unit that it becomes, and by what it is multiplied."""
 TIMES = {"t_s": 1_000_000_000, "t_ms": 1_000_000, "t_us": 1000, "t_ns": 1}
 """The columns of times, and how many nanoseconds are one of each."""
+RANK = {name: rank for rank, name in enumerate(CANONICAL)}
 BASES = {unit: unit for unit in UNITS} | {unit: base for unit, (base, _) in FACTORS.items()}
 BASES |= {name.removeprefix("t_"): "s" for name in TIMES}
 """The unit that each unit that is taken becomes."""
@@ -66,6 +68,17 @@ DIRECTIONS = ("bearing_rad", "azimuth_rad", "elevation_rad", "normal_rad")
 """The columns of directions, which are within a turn."""
 GLOBE = {"lat_deg": "x_m", "lon_deg": "y_m", "height_m": "z_m"}
 """Columns of positions on the globe, and those of the tangent plane whose place in a row they take."""
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return columns in the order in which they make a control or an observation, unknown ones last."""
+    return sorted(names, key=lambda name: RANK.get(name, len(RANK)))
+
+
+def in_own_unit(name: str) -> tuple[str, float]:
+    """Return a column in kalmark's unit, and by what numbers in the unit of its name are multiplied."""
+    stem, _, unit = name.rpartition("_")
+    return (f"{stem}_{FACTORS[unit][0]}", FACTORS[unit][1]) if unit in FACTORS else (name, 1.0)
 
 
 def split_unit(name: str) -> tuple[str, str]:

@@ -40,7 +40,7 @@ MOST_REJECTED = 0.2  # of the fixes
 STRETCHES = 10  # of a robot's path, each with its difference from the batch solution
 
 if TYPE_CHECKING:
-    from kalmark.logs.log import Log
+    from kalmark.logs.log import Log, SensorKey
     from kalmark.results.recording import Recording
     from kalmark.slam.slam import Slam
 
@@ -194,7 +194,8 @@ def _moved(history: History, again: Mapping[str, Restart]) -> Array:
         before = (history.robot == robot) & (history.t_ns <= restart.t_ns)  # a fix follows the scans of its time
         poses[before] = restart.onto.poses(poses[before])
     for gap in history.carried():
-        lost, found = np.flatnonzero(history.while_carried(gap)), np.searchsorted(history.t_ns, gap.end_ns)
+        lost = np.flatnonzero(history.between(gap.robot, gap.start_ns, gap.end_ns))
+        found = np.searchsorted(history.t_ns, gap.end_ns)
         before = poses[lost].copy()
         for step, pose in zip(lost, before, strict=True):
             poses[step] = moved_with(pose, before[-1], poses[found])
@@ -234,7 +235,7 @@ def _surveyed(history: History) -> Known:
     return {as_id(prior.landmark): (prior.mean, prior.covariance) for prior in points}
 
 
-def filter_only_sensors(slam: Slam) -> set[tuple[str, str]]:
+def filter_only_sensors(slam: Slam) -> set[SensorKey]:
     """Return the sensors (robot, name) whose readings no batch solution has: of the state, and of range rates."""
     return {key for key, mount in mounts_of(slam.robots).items() if isinstance(mount.sensor, SeesVelocity | OfState)}
 

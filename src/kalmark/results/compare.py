@@ -15,7 +15,7 @@ from kalmark.arrays import Array
 from kalmark.errors import RunError
 from kalmark.events import short_text
 from kalmark.results.evaluate import summary_of
-from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, Figures, column_header, figure, flatten
+from kalmark.results.figure_texts import BATCH, MORE, ROBOT, TOTALS, Figures, TextRow, column_header, figure, flatten
 from kalmark.results.history import Ints
 from kalmark.results.measures import rigid, rmse
 from kalmark.results.plot import draw_plan, legend
@@ -40,7 +40,7 @@ class Comparison:
         """The names of the runs."""
         return [*self.runs]
 
-    def tables(self) -> Iterator[tuple[str, list[tuple[str, ...]]]]:
+    def tables(self) -> Iterator[tuple[str, list[TextRow]]]:
         """Yield the tables: their titles and rows, a label and what each run has."""
         words = {key: column_header(label, unit) for key, label, unit in (*MORE, *BATCH, *TOTALS, *ROBOT)}
         words["path_difference_m"] = "path off the first run's, aligned (m)"

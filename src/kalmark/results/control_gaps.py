@@ -58,7 +58,7 @@ def while_lost(history: History) -> Flags:
     for gap in history.gaps:
         known_s = _known_s(history, gap) if gap.sigma_m > 0.0 else gap.end_ns * 1e-9
         until_ns = np.inf if known_s is None else known_s * 1e9 - 1.0
-        out |= (history.robot == gap.robot) & (history.t_ns >= gap.start_ns) & (history.t_ns < until_ns)
+        out |= history.between(gap.robot, gap.start_ns, until_ns)
     return out
 
 

@@ -15,6 +15,7 @@ from typing import Any
 Figures = dict[str, Any]  # by their keys in ``summary.json``
 Summary = Mapping[str, Any]  # figures that are read
 Words = tuple[tuple[str, str, str], ...]
+TextRow = tuple[str, ...]  # of a table
 
 
 _ROWS = [*csv.DictReader((resources.files("kalmark.results") / "figures.csv").read_text("utf-8").splitlines())]
@@ -45,7 +46,7 @@ DIFFERENCE_TITLE = "Difference of the poses from the batch solution"
 DIFFERENCE_COLUMNS = ("robot", "from s", "to s", "sigmas of the filter")
 
 
-def difference_rows(summary: Summary) -> list[tuple[str, ...]]:
+def difference_rows(summary: Summary) -> list[TextRow]:
     """Return the differences of the poses over time that a comparison with the batch solution has, as a table."""
     rows = summary.get("batch", {}).get("pose_differences", ())
     return [(r["robot"], *(f"{r[key]:.1f}" for key in ("start_s", "end_s")), figure(r["sigmas"])) for r in rows]

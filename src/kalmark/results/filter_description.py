@@ -15,7 +15,7 @@ from kalmark.declare import declared_options, is_own, own_name, parameters, plac
 from kalmark.events import Id, Scan
 from kalmark.geometry.frames3d import compose
 from kalmark.logs import known_formats
-from kalmark.logs.log import Log
+from kalmark.logs.log import Log, SensorKey
 from kalmark.models.protocols import FullSensor, SegmentVisible, finds_depth, self_calibrating
 from kalmark.models.sensors import TagCorners
 from kalmark.models.tags import project_corners, tag_seen_from
@@ -112,7 +112,7 @@ class Focal(Protocol):
     cy_px: float
 
 
-def mounts_of(robots: Mapping[str, Robot]) -> dict[tuple[str, str], Mount]:
+def mounts_of(robots: Mapping[str, Robot]) -> dict[SensorKey, Mount]:
     """Return the mounts of robots' sensors, by robot and sensor."""
     return {(robot.name, name): m for robot in robots.values() for name, m in robot.sensors.items()}
 

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id, list_names
+from kalmark.logs.log import Names, SensorKey
 from kalmark.report import ELSEWHERE, Gap
 
 __all__ = [
@@ -30,7 +31,6 @@ Arrays = dict[str, npt.NDArray[Any]]
 Named = Mapping[str, npt.NDArray[Any]]
 Vector = Annotated[Array, 1]
 Matrix = Annotated[Array, 2]
-Names = tuple[str, ...]
 Size = tuple[float, float]
 R = TypeVar("R", bound=tuple[Any, ...])
 K = TypeVar("K")
@@ -175,7 +175,7 @@ class MapSnapshot(NamedTuple):
     ids: tuple[Id, ...]
     means: Array
     covariances: Array
-    kinds: tuple[str, ...]
+    kinds: Names
     shape: Array
     robots: Array
     correlations: Array = NONE
@@ -402,7 +402,7 @@ class History:
         """The robots (O,) that made the observations."""
         return self.robot[self.step]
 
-    def sensor_keys(self) -> list[tuple[str, str]]:
+    def sensor_keys(self) -> list[SensorKey]:
         """Return the robot and the sensor of each observation (O of them)."""
         return list(zip(self.observers.tolist(), self.sensor.tolist(), strict=True))
 
@@ -423,15 +423,15 @@ class History:
         """Return when robots, or some of them, were elsewhere than the filter had them, until it found them."""
         return [gap for gap in self.gaps if gap.kind == ELSEWHERE and (not robots or gap.robot in robots)]
 
-    def while_carried(self, gap: Gap) -> Flags:
-        """Return which steps (S,) are of a robot that was elsewhere."""
-        return (self.robot == gap.robot) & (self.t_ns >= gap.start_ns) & (self.t_ns < gap.end_ns)
+    def between(self, robot: str, start_ns: int, end_ns: float) -> Flags:
+        """Return which steps (S,) are of a robot from a time on, before another."""
+        return (self.robot == robot) & (self.t_ns >= start_ns) & (self.t_ns < end_ns)
 
     def associated_elsewhere(self) -> Flags:
         """Return at which steps (S,) a robot was not where its scan was associated; the scan that placed it counts."""
         out = np.zeros(len(self.t_ns), dtype=np.bool_)
         for gap in self.carried():
-            out |= (self.robot == gap.robot) & (gap.start_ns <= self.t_ns) & (self.t_ns <= gap.end_ns)
+            out |= self.between(gap.robot, gap.start_ns, gap.end_ns + 1)
         return out
 
     @property
@@ -465,7 +465,7 @@ class History:
         return float(self.t_ns[step]) * 1e-9
 
     @property
-    def robots(self) -> tuple[str, ...]:
+    def robots(self) -> Names:
         """The robots in the order of their starts, then of their first scans."""
         return tuple(dict.fromkeys([s.robot for s in self.starts] + self.robot.tolist()))
 
@@ -598,9 +598,20 @@ def ints(values: Sequence[int]) -> Ints:
     return np.array(values, dtype=np.int64)
 
 
-def texts(values: list[Any]) -> Texts:
+def floats(values: Sequence[Any]) -> Array:
+    """Return numbers, or lists of so many each, as an array (N, ...), NaN for None."""
+    return np.array(values, dtype=np.float64)
+
+
+def texts(values: Sequence[Any]) -> Texts:
     """Return ids or names as an array of texts (N,), "" for None."""
     return np.array(["" if value is None else str(value) for value in values], dtype=np.str_)
+
+
+def columns_of(rows: Sequence[tuple[Any, ...]], **kinds: Callable[[Sequence[Any]], Any]) -> dict[str, Any]:
+    """Return the columns of rows by their names, each as the array that its kind makes of it."""
+    values = zip(*rows, strict=True) if rows else [()] * len(kinds)
+    return {name: kind(column) for (name, kind), column in zip(kinds.items(), values, strict=True)}
 
 
 def pad_blocks(blocks: Sequence[Array], counts: list[int], width: int, matrices: bool = False) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -39,6 +40,8 @@ from kalmark.results.history import (
     RelocatedRobot,
     RobotStart,
     UsedFix,
+    columns_of,
+    floats,
     ints,
     pad_blocks,
     texts,
@@ -296,14 +299,10 @@ class Recorder:
 
     def _history(self) -> History:
         reports = self.reports
-        rows = [(s, scan, o) for s, scan in enumerate(self.scans) for o in reports[s].observations]
-        seen = [o for _, _, o in rows]
         counts = [len(report.observations) for report in reports]
         m, p = (max((getattr(r, key).shape[1] for r in reports if r.observations), default=2) for key in "yz")
         spaces = [robot.motion.space for robot in self.slam.robots.values()]
         n, q = max(space.size for space in spaces), max(space.dof for space in spaces)
-        late = {one for report in reports for one in report.late}
-        known = [self.log.true_ids.get(scan, scan.ids) for scan in self.scans]  # also those that the filter did not get
         ones = [1] * len(reports)
         return History(
             t_ns=ints([r.t_ns for r in reports]),
@@ -311,25 +310,13 @@ class Recorder:
             mean=pad_blocks([mean[None] for mean, _ in self.states], ones, n),
             covariance=pad_blocks([P[None] for _, P in self.states], ones, q, matrices=True),
             dead_reckoned=pad_blocks([r[None] for r in self.dead], ones, n),
-            step_us=np.array(self.step_ns, dtype=np.float64) * 1e-3,
-            step=ints([s for s, _, _ in rows]),
-            sensor=texts([scan.sensor for _, scan, _ in rows]),
-            index=ints([o.index for o in seen]),
-            id=texts([None if scan.ids is None else scan.ids[o.index] for _, scan, o in rows]),
-            outcome=texts([o.outcome for o in seen]),
-            landmark=texts([o.landmark for o in seen]),
-            d2=np.array([np.nan if o.d2 is None else o.d2 for o in seen], dtype=np.float64),
-            reason=texts([o.reason for o in seen]),
+            step_us=floats(self.step_ns) * 1e-3,
             y=pad_blocks([r.y for r in reports], counts, m),
             e=pad_blocks([r.e for r in reports], counts, m),
             z=pad_blocks([r.z for r in reports], counts, p),
             Z=pad_blocks([r.Z for r in reports], counts, p, matrices=True),
-            kind=texts(list(self.kinds)),
+            kind=texts(self.kinds),
             left_px=np.concatenate(self.left),
-            true_id=texts([None if (ids := known[s]) is None else ids[o.index] for s, _, o in rows]),
-            late=np.array(
-                [(scan.t_ns, scan.robot, scan.sensor, o.index) in late for _, scan, o in rows], dtype=np.bool_
-            ),
             noise=pad_blocks([stated_noise(self.slam, r) for r in reports], counts, p),
             maps=tuple(self.maps),
             controls={name: of._replace(number=round(of.number)) for name, of in self.controls.items()},
@@ -344,9 +331,25 @@ class Recorder:
             gaps=merge_gaps(self.gaps),
             repeats=repeat_rows(self.slam),
             stepped=self.stepped_by,
+            **self._observations(),
             **decisions(reports, 3 if any(space.world == "space" for space in spaces) else 2),
             **self.expectations.columns(m, p),
         )
+
+    def _observations(self) -> dict[str, Any]:
+        """Return fields of a history that have a value for each observation."""
+        late = {one for report in self.reports for one in report.late}
+        rows = []
+        for step, (scan, report) in enumerate(zip(self.scans, self.reports, strict=True)):
+            true = self.log.true_ids.get(scan, scan.ids)  # also those that the filter did not get
+            for o in report.observations:
+                ids = (None if of is None else of[o.index] for of in (scan.ids, true))
+                was_late = (scan.t_ns, scan.robot, scan.sensor, o.index) in late
+                rows.append((step, scan.sensor, o.index, *ids, o.outcome, o.landmark, o.d2, o.reason, was_late))
+        return columns_of(
+            rows, step=ints, sensor=texts, index=ints, id=texts, true_id=texts, outcome=texts, landmark=texts,
+            d2=floats, reason=texts, late=partial(np.array, dtype=np.bool_),
+        )  # fmt: skip
 
 
 def decisions(reports: list[Report], d: int) -> dict[str, Any]:
@@ -354,7 +357,7 @@ def decisions(reports: list[Report], d: int) -> dict[str, Any]:
     counts = [len(report.observations) for report in reports]
     first = np.cumsum([0, *counts]).tolist()
     told = list(zip(first, reports, strict=False))
-    seen = [(start + c.index, c) for start, report in told for c in report.candidates]
+    compared = [(start + c.index, c.landmark, c.d2, c.place) for start, report in told for c in report.candidates]
     shares = [
         (start + k, name, weight)
         for start, report in told
@@ -369,16 +372,14 @@ def decisions(reports: list[Report], d: int) -> dict[str, Any]:
             *(LandmarkChange(step, str(gone), "removed", "", why) for gone, why in report.removed),
         )
     ]
-    return {
-        "candidate_row": ints([row for row, _ in seen]),
-        "candidate_landmark": texts([c.landmark for _, c in seen]),
-        "candidate_d2": np.array([c.d2 for _, c in seen], dtype=np.float64),
-        "candidate_place": np.array([c.place for _, c in seen], dtype=np.float64).reshape(-1, d),
+    named = columns_of(
+        compared, candidate_row=ints, candidate_landmark=texts, candidate_d2=floats,
+        candidate_place=lambda places: floats(places).reshape(-1, d),
+    )  # fmt: skip
+    named |= columns_of(shares, share_row=ints, share_landmark=texts, share_weight=floats)
+    return named | {
         "seen_at": pad_blocks([report.seen_at for report in reports], counts, d),
         "changes": tuple(changes),
-        "share_row": ints([row for row, _, _ in shares]),
-        "share_landmark": texts([name for _, name, _ in shares]),
-        "share_weight": np.array([weight for _, _, weight in shares], dtype=np.float64),
     }
 
 

@@ -36,7 +36,7 @@ from kalmark.results.truth import Truth
 from kalmark.slam.description import plain_value
 
 if TYPE_CHECKING:
-    from kalmark.logs.log import Log, Section
+    from kalmark.logs.log import Log, Names, Section
     from kalmark.slam.slam import Slam
 
 ASSOCIATIONS = ("t_s", "robot", "sensor", "index", "id", "outcome", "landmark", "d2", "reason")
@@ -126,7 +126,7 @@ class LogReference:
     name: str = ""
     format: str = ""
     path: str | None = None
-    robots: tuple[str, ...] = ()
+    robots: Names = ()
 
     def as_dict(self) -> Figures:
         """Return the reference as it stands in ``summary.json``."""

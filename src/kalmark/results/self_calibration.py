@@ -18,7 +18,7 @@ from kalmark.arrays import Array
 from kalmark.declare import unit_of
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.log import Section
-from kalmark.results.figure_texts import Figures, Summary, figure
+from kalmark.results.figure_texts import Figures, Summary, TextRow, figure
 from kalmark.results.history import Biased, CalibratedMount
 from kalmark.results.measures import sigmas
 
@@ -126,14 +126,14 @@ def _found(summary: Summary) -> Iterator[tuple[str, Figures, str, str]]:
             yield name, row, _sigma(row["prior_sigma"], row["unit"]), _sigma(row["sigma"], row["unit"])
 
 
-def mount_rows(summary: Summary) -> list[tuple[str, ...]]:
+def mount_rows(summary: Summary) -> list[TextRow]:
     """Return a row of text for every direction of every mount in a summary: mount, direction, before, after, ratio."""
     return [(name, row["direction"], *sigmas, f"{row['ratio']:.3f}") for name, row, *sigmas in _found(summary)]
 
 
-def estimate_rows(summary: Summary) -> list[tuple[str, ...]]:
+def estimate_rows(summary: Summary) -> list[TextRow]:
     """Return a row of text for every constant of a mount, a range or a control that was estimated."""
-    rows: list[tuple[str, ...]] = []
+    rows: list[TextRow] = []
     for name, figures in {**summary.get("mounts", {}), **summary.get("biases", {})}.items():
         for key, value in figures.items():
             sigma = figures.get(f"sigma_{key}", figures.get(_SIGMA_OF.get(key, ""), 0.0))

@@ -13,7 +13,7 @@ from kalmark.events import Id
 from kalmark.geometry.angles import wrap
 from kalmark.geometry.pose_frames import ORIGIN
 from kalmark.geometry.rotations import from_matrix, matrix
-from kalmark.logs.log import LandmarkPlaces, Log, PositionTrack, poses_of_size
+from kalmark.logs.log import LandmarkPlaces, Log, Names, PositionTrack, poses_of_size
 from kalmark.results.history import Arrays, History, Named, RobotStart, as_id, ints, padded_all, texts
 from kalmark.results.landmark_table import TAG
 from kalmark.results.measures import Rigid, pose_error, sigmas
@@ -37,7 +37,7 @@ class Truth:
     fixes: dict[str, PositionTrack] = field(default_factory=dict)
     offset: Array = field(default_factory=lambda: ORIGIN[3])
     anchored: bool = False
-    robots: tuple[str, ...] = ()
+    robots: Names = ()
 
     @classmethod
     def of(cls, log: Log, history: History, anchored: bool = False) -> Truth:

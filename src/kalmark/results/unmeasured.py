@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from kalmark.report import Expectations, Report
-from kalmark.results.history import ints, padded_all, texts
+from kalmark.results.history import columns_of, ints, padded_all, texts
 
 if TYPE_CHECKING:
     from kalmark.slam.slam import Slam
@@ -79,11 +79,8 @@ class ExpectationRecorder:
         each = [(step, asked, i) for step, asked, rows in self._kept for i in rows]
         e = padded_all([np.full(m, np.nan), *(asked.e[i] for _, asked, i in each)])[1:]
         Z = padded_all([np.full((p, p), np.nan), *(asked.Z[i] for _, asked, i in each)], 2)[1:]
-        return {
-            "unmeasured_step": ints([step for step, _, _ in each]),
-            "unmeasured_sensor": texts([asked.sensor for _, asked, _ in each]),
-            "unmeasured_landmark": texts([asked.names[i] for _, asked, i in each]),
-            "unmeasured_kind": texts([asked.kinds[i] for _, asked, i in each]),
-            "unmeasured_e": e,
-            "unmeasured_Z": Z,
-        }
+        named = columns_of(
+            [(step, asked.sensor, asked.names[i], asked.kinds[i]) for step, asked, i in each],
+            unmeasured_step=ints, unmeasured_sensor=texts, unmeasured_landmark=texts, unmeasured_kind=texts,
+        )  # fmt: skip
+        return named | {"unmeasured_e": e, "unmeasured_Z": Z}

@@ -21,8 +21,8 @@ from kalmark.events import Control, Frame, short_text
 from kalmark.files import unpack_file
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.logs.log import Log, Names, Section, Times, Trajectory, interpolate
-from kalmark.logs.source import Format, Request, number_of_text, one_of, read_text, rows_in_time
-from kalmark.logs.table_columns import INERTIAL, TWIST3
+from kalmark.logs.source import Format, Request, one_of, raise_refusal, read_text, timed_rows
+from kalmark.logs.table_columns import INERTIAL, POSITION, TWIST3
 from kalmark.models.motion import noise_densities
 from kalmark.vision.camera_calibration import read_calibration
 from kalmark.vision.image_files import frames_of
@@ -43,6 +43,7 @@ SURE = {
 }
 AT_REST = {"at_rest": True, "sigma_bias_w_radps": 0.1, "sigma_bias_a_mps2": 0.1}
 BIASES = tuple(f"bias_{name}" for name in INERTIAL)
+STATE = (*POSITION, "qw", "qx", "qy", "qz", *TWIST3[:3], *BIASES)
 
 
 def find(path: Path) -> Path | None:
@@ -72,7 +73,7 @@ def read(
     begin, end = (pick(frame.t_ns for frame in frames) for pick in (min, max))
     states = true_states(path)
     truth = {} if states is None else {ROBOT: Trajectory(states.t_ns, states.rows[:, :7])}
-    readings = csv_of(path / "imu0" / "data.csv", 7) if imu == "auto" else None
+    readings = csv_of(path / "imu0" / "data.csv", INERTIAL) if imu == "auto" else None
     name = (path.resolve().parent if path.name == "mav0" else path).name
     if readings is None:
         return camera_log("euroc", path, request, frames, sections, MOTION, name=name, truth=truth)
@@ -112,23 +113,16 @@ def lines_of(file: Path) -> Iterator[tuple[int, list[str]]]:
             yield line, [cell.strip() for cell in content.split(",")]
 
 
-def csv_of(file: Path, columns: int) -> TimedRows | None:
+def csv_of(file: Path, names: Names) -> TimedRows | None:
     """Return a table of EuRoC, ns and numbers, without rows that run back in time; None if there is no such file.
 
     Raises LogError.
     """
     if not file.is_file() and not file.with_name(f"{file.name}.gz").is_file():
         return None
-    found: dict[int, list[float]] = {}
-    for line, t_ns, cells in rows_in_time(file, lines_of(file), unit="ns"):
-        try:
-            found[t_ns] = [number_of_text(cell) for cell in cells]
-            if len(cells) != columns - 1:
-                raise ValueError
-        except ValueError:
-            row = short_text(",".join(cells))
-            raise LogError(f"{file}:{line}: {row}, expected {columns - 1} finite numbers after the time") from None
-    return TimedRows(np.array([*found], dtype=np.int64), np.array([*found.values()]))
+    rows = [*timed_rows(file, names, raise_refusal, lines_of(file), "ns", strictly=True)]
+    t_ns = np.array([t_ns for _, t_ns, _ in rows], dtype=np.int64)
+    return TimedRows(t_ns, np.array([numbers for *_, numbers in rows]))
 
 
 def true_states(path: Path) -> TimedRows | None:
@@ -142,7 +136,7 @@ def true_states(path: Path) -> TimedRows | None:
         if len(others) != 1:
             return None
         file = others[0]
-    table = csv_of(file, 17)
+    table = csv_of(file, STATE)
     assert table is not None
     order = [0, 1, 2, 4, 5, 6, 3, *range(7, 16)]  # EuRoC's quaternions begin with w
     states = table.rows[:, order]
