@@ -186,7 +186,11 @@ def landmark_fields(kind: str, definitions: Mapping[str, Any]) -> dict[str, str]
         groups.setdefault(path.partition("[].")[0] if "[]." in path else "[]" if "[]" in path else "", {})[path] = base
     for _, group in sorted(groups.items(), key=lambda item: item[0] in ("", "[]")):
         numbers = [path for path, base in group.items() if base not in ("string", "bool")]
-        ids = [path for path, base in group.items() if _is_id(path) and "float" not in base]
+        ids = [
+            path
+            for path, base in group.items()
+            if "float" not in base and words_of_name(path)[-1:] == [ID] and not OTHERS & {*words_of_name(path)}
+        ]
         found = _place(numbers) or _polar(numbers)
         if ids and found:
             return {ID: min(ids, key=lambda path: words_of_name(path)[-1:] != words_of_name(path))} | found
@@ -197,10 +201,6 @@ def words_of_name(path: str) -> list[str]:
     """Return the words of the last name of a path, in the singular."""
     name = path.removesuffix("[]").rpartition(".")[2]
     return [word.rstrip("s") for word in re.sub("([a-z0-9])([A-Z])", r"\1_\2", name).lower().split("_") if word]
-
-
-def _is_id(path: str) -> bool:
-    return words_of_name(path)[-1:] == [ID] and not OTHERS & {*words_of_name(path)}
 
 
 def _place(paths: list[str]) -> dict[str, str]:

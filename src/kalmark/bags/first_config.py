@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -24,13 +24,18 @@ LATER = ("filtered", "global", "map", "gps")  # odometry of these names has been
 WANTED = ("goal", "target", "setpoint", "clicked", "initial", "desired")  # poses that the robot is to have
 WORLD = ("map", "odom", "world", "earth")
 LEAST_POSES = 10
-SPACE = ("", "odometry_3d", "velocity_3d", "inertial")
+SPACE = ("odometry_3d", "velocity_3d", "inertial")
 COASTING = {
     True: {"type": "constant_velocity_3d", "sigma_v_mps_per_sqrt_s": 0.3, "sigma_w_radps_per_sqrt_s": 0.3},
     False: {"type": "constant_velocity", "sigma_vx_mps_per_sqrt_s": 0.3, "sigma_vy_mps_per_sqrt_s": 0.3,
             "sigma_w_radps_per_sqrt_s": 0.3},
 }  # fmt: skip
 """The motion of a robot without controls, in space or in the plane."""
+GUESSED: dict[str, tuple[Section, str]] = {
+    "ackermann": ({"wheelbase_m": 2.83, "encoder_offset_m": 0.0}, f"{GUESS} its wheelbase; "),
+    "inertial": ({"preset": "mems_imu"}, f"{GUESS} a small unit, whose frame is the robot's; "),
+}
+"""Further keys of motions, and the words for them."""
 AT_REST = {"sigma_v_mps": 0.5, "sigma_w_radps": 0.5}
 STILL_UNIT = {"at_rest": True, "sigma_bias_w_radps": 0.1, "sigma_bias_a_mps2": 0.1}
 IMAGES_ADVICE = "images: `{type: images}` gives them to the detector of a sensor, such as tags (docs/detectors.md)"
@@ -77,6 +82,19 @@ def first_config(found: Survey, file: Path | None = None) -> str:
         out += [f"  {yaml_text(robot)}:", *(f"    {line}" for line in section)]
     out += writer.tail
     return "\n".join(out) + "\n"
+
+
+def motion_lines(kind: str, space: bool) -> Iterator[str]:
+    """Yield the lines of a robot's motion of this kind, "" without controls, and of its start if it is at rest."""
+    if kind == "inertial":
+        yield f"start: {yaml_mapping(STILL_UNIT)}  # {GUESS} at rest for half a second or more"
+    if kind:
+        more, why = GUESSED.get(kind, ({}, ""))
+        motion = yaml_mapping({"type": kind} | more)
+        yield f"motion: {motion}  # {why}its noise has defaults; `kalmark tune` estimates it"
+    else:
+        yield f"motion: {yaml_mapping(COASTING[space])}  # {GUESS} there is no topic of controls"
+        yield f"start: {yaml_mapping(AT_REST)}  # {GUESS} at rest, about"
 
 
 class _Writer:
@@ -142,9 +160,10 @@ class _Writer:
         control, kind = self.control(
             robot, topics, not any(topic.columns[:1] in (("u_px",), ("u1_px",)) for topic in scans)
         )
-        if control is None and not any(topic.columns[:2] == BEAM for topic in scans):
+        beams = any(topic.columns[:2] == BEAM for topic in scans)
+        if control is None and not beams:
             control, kind = self.inertial(topics)
-        space = kind in SPACE if kind else not any(topic.columns[:2] == BEAM for topic in scans)
+        space = kind in SPACE if kind else not beams
         used = self.used(robot, topics, scans, control, kind, space)
         start = start_of(self.found, control, used, space)
         true = [self.found.named(name).poses.frames for name, (entry, _) in used.items() if entry["type"] == "truth"]
@@ -159,18 +178,7 @@ class _Writer:
             for topic in topics
             if topic.name not in used
         ]
-        lines = []
-        if kind:
-            car: Section = {"wheelbase_m": 2.83, "encoder_offset_m": 0.0} if kind == "ackermann" else {}
-            why = f"{GUESS} its wheelbase; " if car else ""
-            if kind == "inertial":
-                car, why = {"preset": "mems_imu"}, f"{GUESS} a small unit, whose frame is the robot's; "
-                lines.append(f"start: {yaml_mapping(STILL_UNIT)}  # {GUESS} at rest for half a second or more")
-            motion = yaml_mapping({"type": kind} | car)
-            lines.append(f"motion: {motion}  # {why}its noise has defaults; `kalmark tune` estimates it")
-        elif used:
-            lines += [f"motion: {yaml_mapping(COASTING[space])}  # {GUESS} there is no topic of controls"]
-            lines += [f"start: {yaml_mapping(AT_REST)}  # {GUESS} at rest, about"]
+        lines = [*motion_lines(kind, space)] if kind or used else []
         lines += [] if start is None else [readings.start()]
         if scans or readings.sensors:
             lines += ["sensors:", *(f"  {line}" for line in readings.sensors)]
@@ -235,8 +243,9 @@ class _Writer:
             return topic, "ackermann"
         for topic in sorted((t for t in topics if t.offers.twist), key=lambda t: ("cmd" in t.name, t.name)):
             return topic, velocity
-        for topic in (t for t in estimated if t.offers.pose and not t.offers.noisy and _is_path(t)):
-            return topic, odometry(topic.poses)
+        for topic in (t for t in estimated if t.offers.pose and not t.offers.noisy and t.poses.moves):
+            if len(topic.poses.frames) >= LEAST_POSES and not _has_word(topic, WANTED):
+                return topic, odometry(topic.poses)
         return None, ""
 
     def inertial(self, topics: Sequence[TopicSummary]) -> tuple[TopicSummary | None, str]:
@@ -323,10 +332,6 @@ def _moves(topic: TopicSummary) -> bool:
 
 def _has_word(topic: TopicSummary, words: Sequence[str]) -> bool:
     return any(word in topic.name.lower() for word in words)
-
-
-def _is_path(topic: TopicSummary) -> bool:
-    return topic.poses.moves and len(topic.poses.frames) >= LEAST_POSES and not _has_word(topic, WANTED)
 
 
 def _is_odometry(parent: str, child: str) -> bool:

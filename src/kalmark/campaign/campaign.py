@@ -21,7 +21,7 @@ from kalmark.files import replace_folder, write
 from kalmark.geometry.gaussian import quantile
 from kalmark.results.evaluate import none_for_nan
 from kalmark.results.figure_texts import Figures
-from kalmark.results.measures import finite_mean
+from kalmark.results.measures import finite_mean, ratio
 from kalmark.results.scene import COLOURS, group_steps
 
 POINTS = 400  # of a curve, at most
@@ -116,8 +116,7 @@ def figures(scores: Sequence[Scores], skip: int = 0) -> Figures:
     result["landmark_rmse_m"] = rms([s.landmark_rmse_m for s in scores])
     result["landmark_rmse_raw_m"] = rms([s.landmark_rmse_raw_m for s in scores])
     result["landmarks"] = finite_mean([s.landmarks for s in scores])
-    dof = sum(s.nis_dof for s in scores)
-    result["nis_per_dof"] = sum(s.nis for s in scores) / dof if dof else float("nan")
+    result["nis_per_dof"] = ratio(sum(s.nis for s in scores), sum(s.nis_dof for s in scores))
     return result | mount_uncertainties(scores)
 
 

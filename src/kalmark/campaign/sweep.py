@@ -22,7 +22,7 @@ from kalmark.events import is_number
 from kalmark.files import replace_file, replace_folder, write
 from kalmark.results.figure_texts import Figures
 from kalmark.results.history import grouped
-from kalmark.results.measures import finite_mean
+from kalmark.results.measures import finite_mean, ratio
 from kalmark.results.run_page import figure_text, html_table, read_page, tagged
 from kalmark.results.scene import COLOURS
 
@@ -44,7 +44,7 @@ def run_figures(score: Scores, names: list[str], skip: int) -> Figures:
     row["position_rmse_m"] = rms(series["position_m"])
     row["heading_rmse_deg"] = float(np.degrees(rms(series["heading_rad"])))
     row |= {"landmark_rmse_m": score.landmark_rmse_m, "landmark_rmse_raw_m": score.landmark_rmse_raw_m}
-    row |= {"landmarks": score.landmarks, "nis_per_dof": score.nis / score.nis_dof if score.nis_dof else float("nan")}
+    row |= {"landmarks": score.landmarks, "nis_per_dof": ratio(score.nis, score.nis_dof)}
     if "mount" in names:
         row["mount_m"] = largest_last_value(series["mount_m"])
         row["mount_deg"] = float(np.degrees(largest_last_value(series["mount_rad"])))
@@ -118,7 +118,8 @@ class Sweep:
         found = [(key, label) for key, label in FIGURES if any(f.get(key) is not None for _, f in rows)]
         found = [(key, label) for key, label in found if not keys or key in keys]
         words = [self.campaigns[0].label(label) if key.endswith("_anees") else label for key, label in found]
-        head = [*(key.rpartition(".")[2] if self._short else key for key in self.keys), "estimator", *words]
+        last = [key.rpartition(".")[2] for key in self.keys]
+        head = [*(last if len({*last}) == len(last) else self.keys), "estimator", *words]
         return head, [[*first, *(_percent(key, f.get(key)) for key, _ in found)] for first, f in rows]
 
     def save(self, folder: str | Path) -> Path:
@@ -213,11 +214,6 @@ class Sweep:
                 words.append(of + value_as_yaml(row[key]))
         swept = any(key.endswith("estimator.type") for key in self.keys)
         return ", ".join(words if swept else [*words, row["estimator"]])
-
-    @property
-    def _short(self) -> bool:
-        """True if the last words of the keys differ."""
-        return len({key.rpartition(".")[2] for key in self.keys}) == len(self.keys)
 
 
 def _percent(key: str, value: Any) -> Any:

@@ -29,6 +29,7 @@ is J C J^T, J = [R(u) 0; 0 1] in the plane, [R(u) 0; 0 2 Jr(u)^-1] in space, wit
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -44,7 +45,7 @@ from kalmark.geometry import frames, frames3d
 from kalmark.geometry.named_poses import describe_pose
 from kalmark.geometry.rotations import left_jacobian_inverse, log, matrix, skew
 from kalmark.logs.known_map import from_triangle
-from kalmark.logs.log import LandmarkPlaces, Log, Names, Section, Trajectory
+from kalmark.logs.log import LandmarkPlaces, Log, Section, Trajectory
 from kalmark.logs.source import (
     Format,
     Request,
@@ -203,7 +204,7 @@ def read(
 def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool) -> Log:
     """Return the log of a graph whose poses have these ids, in order."""
     space = any(len(u) == 6 for u, _ in graph.moves.values()) or any(len(p) == 7 for p in graph.poses.values())
-    size, d = (6, 3) if space else (3, 2)
+    size = 6 if space else 3
     t_ns = {one: k * STEP_NS for k, one in enumerate(ids)}
     if any(len(u) != size for u, _ in graph.moves.values()):
         raise LogError(f"{path}: edges of the plane and of space, expected one kind")
@@ -213,35 +214,38 @@ def _log(path: Path, request: Request, graph: Graph, ids: list[int], true: bool)
             raise LogError(f"{path}: no edge from pose {a} to pose {b}, expected one from each pose to the next")
         u, C = graph.moves[a, b]
         events.append(Control(t_ns=t_ns[b], robot=ROBOT, u=u, cov=C))
-    scans = _loops(graph, ids, t_ns)
-    for (name, at), seen in graph.sights.items():
-        numbers = 1 if name == BEARINGS and not space else d
-        first = {one: (y, C) for one, y, C in reversed(seen)}
-        if len(first) < len(seen):
-            twice = len(seen) - len(first)
-            request.leave_out(twice, f"{path}: {twice} observations of a landmark that pose {at} has already")
-        if any(len(y) != numbers for y, _ in first.values()):
-            world = "space" if space else "the plane"
-            raise LogError(f"{path}: pose {at} has observations of another world, expected those of {world}")
-        y, cov = [y for y, _ in first.values()], [C for _, C in first.values()]
-        scans.append(Scan(t_ns=t_ns[at], robot=ROBOT, sensor=name, y=y, ids=[*first], cov=cov))
-    steps, mount = INCREMENT3 if space else INCREMENT2, graph.offset
-    known: dict[str, tuple[Section, Names]] = {
-        SENSOR: ({"type": "position_3d" if space else "position"}, POSITION[:d]),
-        BEARINGS: ({"type": "bearing", "initialization": {"type": "delayed"}}, BEAM[1:]),
-        LOOPS: ({"type": "odometer", "keep": 0}, steps),
+    scans = [*_loops(graph, ids, t_ns), *_sights(path, request, graph, t_ns, space)]
+    steps = INCREMENT3 if space else INCREMENT2
+    columns = {SENSOR: POSITION[: 3 if space else 2], BEARINGS: BEAM[1:], LOOPS: steps}
+    sections: dict[str, Section] = {
+        SENSOR: {"type": "position_3d" if space else "position"},
+        BEARINGS: {"type": "bearing", "initialization": {"type": "delayed"}},
+        LOOPS: {"type": "odometer", "keep": 0},
     }
-    if mount is not None:
-        known[SENSOR][0]["mount"] = describe_pose(mount)
-    there = {scan.sensor for scan in scans}
-    sections = {name: section for name, (section, _) in known.items() if name in there}
-    columns = {name: names for name, (_, names) in known.items() if name in there}
+    if graph.offset is not None:
+        sections[SENSOR]["mount"] = describe_pose(graph.offset)
+    for name in {*columns} - {scan.sensor for scan in scans}:
+        del columns[name], sections[name]
     told = {"motion": {"type": "odometry_3d" if space else "odometry_2d"}, "sensors": sections}
     rest: dict[str, Any] = {"describes": {"robots": {ROBOT: told}}, "name": path.stem}
     if true and graph.poses:
         path_ = Trajectory.of({t_ns[one]: graph.poses[one] for one in sorted(graph.poses)})
         rest |= {"truth": {ROBOT: path_}, "landmarks": graph.places}
     return one_robot("g2o", path, request, ROBOT, [*events, *scans], steps, columns, **rest)
+
+
+def _sights(path: Path, request: Request, graph: Graph, t_ns: dict[int, int], space: bool) -> Iterator[Scan]:
+    """Yield the observations of landmarks, of each landmark one at a pose.  Raises LogError."""
+    for (name, at), seen in graph.sights.items():
+        first = {one: (y, C) for one, y, C in reversed(seen)}
+        if len(first) < len(seen):
+            twice = len(seen) - len(first)
+            request.leave_out(twice, f"{path}: {twice} observations of a landmark that pose {at} has already")
+        y, cov = zip(*first.values(), strict=True)
+        if {*map(len, y)} != {3 if space else 1 if name == BEARINGS else 2}:
+            world = "space" if space else "the plane"
+            raise LogError(f"{path}: pose {at} has observations of another world, expected those of {world}")
+        yield Scan(t_ns=t_ns[at], robot=ROBOT, sensor=name, y=y, ids=[*first], cov=cov)
 
 
 def _loops(graph: Graph, ids: list[int], t_ns: dict[int, int]) -> list[Scan]:

@@ -30,6 +30,7 @@ from kalmark.results.measures import (
     nees_limit,
     path_m,
     pose_error,
+    ratio,
     rigid_robust,
     rmse,
     similarity,
@@ -341,7 +342,7 @@ def fix_figures(distance: Array) -> Figures:
 def nis_per_dof(history: History) -> float:
     """Return the sum of the normalised innovations squared of the associated observations over their dimensions."""
     value, dof, _ = associated_nis(history)
-    return float(value.sum() / dof.sum()) if len(dof) else float("nan")
+    return ratio(value.sum(), dof.sum())
 
 
 def none_for_nan(value: Any) -> Any:

@@ -133,6 +133,11 @@ def finite_mean(values: Any) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 
+def ratio(total: float, number: float) -> float:
+    """Return a sum over the number of what was added, NaN if there is nothing."""
+    return float(total / number) if number else float("nan")
+
+
 def aligned_rmse(estimate: Array, truth: Array) -> float:
     """Return the RMSE of positions (N, d) after the rigid alignment that makes it least."""
     return rmse(rigid(estimate, truth)(estimate) - truth)

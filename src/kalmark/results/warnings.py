@@ -34,7 +34,7 @@ from kalmark.results.checked import DOUBTFUL, OK, UNCHECKED, WRONG, Sign
 from kalmark.results.control_gaps import gap_warnings
 from kalmark.results.figure_texts import Figures, Summary, count, figure
 from kalmark.results.history import History, Ints, RelocatedRobot, UsedFix, grouped
-from kalmark.results.measures import associated_nis, nis, place_sigma, truncated_variance
+from kalmark.results.measures import associated_nis, nis, place_sigma, ratio, truncated_variance
 from kalmark.results.recording import Recording
 from kalmark.results.repeated_landmarks import repeat_warnings
 from kalmark.results.self_calibration import mount_warnings
@@ -441,7 +441,7 @@ def _fixes(run: Recording, summary: Summary) -> Iterator[str]:
 def fix_nis_per_dof(fixes: tuple[UsedFix, ...]) -> float:
     """Return the sum of the normalised innovations squared of the fixes used over their dimensions, NaN without any."""
     used = [fix for fix in fixes if fix.used]
-    return sum(fix.d2 for fix in used) / sum(len(fix.z) for fix in used) if used else float("nan")
+    return ratio(sum(fix.d2 for fix in used), sum(len(fix.z) for fix in used))
 
 
 def is_overconfident(figures: Summary) -> bool:
