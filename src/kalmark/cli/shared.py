@@ -119,13 +119,13 @@ def print_summary(title: str, summary: Summary) -> None:
 def _print_robots(summary: Summary) -> None:
     """Print a row of figures for each robot, and for each other program on the same log."""
     robots: Summary = summary.get("robots", {})
-    shown = [(key, column_header(label, unit), unit) for key, label, unit in ROBOT]
-    shown = [row for row in shown if any(figures.get(row[0]) is not None for figures in robots.values())]
+    shown = [row for row in ROBOT if any(figures.get(row[0]) is not None for figures in robots.values())]
     if shown:
-        columns = ("robot", *(label for _, label, _ in shown))
-        others = {key: value for key, value in summary.items() if isinstance(value, Mapping) and "ate_raw_m" in value}
-        named = [*robots.items(), *((f"({name})", figures) for name, figures in others.items())]
-        table = [(name, *(cell_text(f.get(key), unit) for key, _, unit in shown)) for name, f in named]
+        columns = ("robot", *(column_header(label, unit) for _, label, unit in shown))
+        others = ((f"({k})", v) for k, v in summary.items() if isinstance(v, Mapping) and "ate_raw_m" in v)
+        table = [
+            (name, *(cell_text(f.get(key), unit) for key, _, unit in shown)) for name, f in (*robots.items(), *others)
+        ]
         print_table("", columns, table, align="<" + ">" * len(shown))
         if any(key == "pose_nees" for key, _, _ in shown):
             most = [figure(f["pose_nees_most"], 2) for f in robots.values() if f.get("pose_nees_most") is not None]
