@@ -159,7 +159,7 @@ def test_a_cure_is_tried_on_the_first_part_of_a_log_that_the_budget_pays() -> No
 
 def test_late_scans_have_the_size_with_which_the_log_is_likeliest() -> None:
     again, late = late_run()
-    verdict = with_cures(again, late, judged(again, late, [], 3000, Trials()), True, 3000, Trials())
+    verdict, _ = with_cures(again, late, judged(again, late, [], 3000, Trials()), True, 3000, Trials())
     assert verdict.causes[0].name == "time_offset"
     (line,) = trials.options_of(verdict.causes[0].cure)
     assert float(line.partition("=")[2]) == pytest.approx(-0.15, abs=0.01)

@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.batch.batch_state import LANDMARKS
+from kalmark.batch.batch_state import LANDMARKS, POSES
 from kalmark.batch.data import replay_events
 from kalmark.batch.problem import observation_factor
 from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.batch_search import associated
 from kalmark.diagnosis.causes import Finding
+from kalmark.diagnosis.error_columns import TURNED, columns_of
 from kalmark.diagnosis.linear import Linear
-from kalmark.diagnosis.onsets import _turns, without_onset
+from kalmark.diagnosis.onsets import _as_turn, without_onset
 from kalmark.diagnosis.trials import Trials
 from kalmark.events import Control, Scan, sort_key
 from kalmark.geometry.frames import compose
@@ -88,7 +89,7 @@ def test_wheels_that_slip_for_a_while_are_named_first_with_both_times(ids: bool)
         ("odometry_turn", ("rover", "w_radps", "offset"), 0.1, lambda u: u - [0.0, -0.1]),
         ("range_scale", ("rover", "lidar", "range_m"), 0.1, lambda y: y / [1.1, 1.0]),
         ("range_offset", ("rover", "lidar", "range_m"), 0.3, lambda y: y - [0.3, 0.0]),
-        ("mount", ("rover", "lidar"), 0.2, lambda y: y - [0.0, -0.2]),
+        ("mount", ("rover", "lidar", "bearing_rad"), 0.2, lambda y: y - [0.0, -0.2]),
         ("mount_position", ("rover", "lidar", "x_m"), 0.2, None),
     ],
 )
@@ -162,7 +163,10 @@ def test_the_turn_of_a_mount_matches_differences(name: str, options: tuple[str, 
     f, factor = next((f, o) for f, o in enumerate(problem.factors) if o.term.blocks[-1].group == LANDMARKS)
     mount = given.robots[factor.sensor[0]].sensors[factor.sensor[1]]
     at, parts = np.array(mount.at), [np.zeros(other.R.shape[:2]) for other in problem.factors]
-    for turn, axis in zip(_turns(linear, f, factor), np.eye(3) if len(at) == 7 else np.ones((1, 1)), strict=True):
+    rates = np.zeros((len(problem.robots), linear.state.spaces[POSES].dof))
+    columns = map(_as_turn, columns_of(linear, {factor.sensor: tuple(mount.sensor.columns)}, rates))
+    turns = [column.Z for column in columns if column.name == TURNED]
+    for turn, axis in zip(turns, np.eye(3) if len(at) == 7 else np.ones((1, 1)), strict=True):
         moved = []
         for step in (h, -h):  # about the sensor
             if len(at) == 7:

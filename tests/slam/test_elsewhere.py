@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import kalmark as km
-from kalmark.config import build_slam
+from kalmark.config import build_slam, open_run
 from kalmark.events import Event
 from kalmark.geometry import compose, frames3d, inverse
 from kalmark.geometry.angles import wrap
@@ -166,6 +168,14 @@ def test_a_robot_that_is_not_stays_where_it_is(ids: bool, seed: int) -> None:
     off, carried = errors(slam_at(poses[0], ids), log_of(poses, places, seed, ids), poses[1:])
     assert not carried
     assert off.max() < 0.8
+
+
+def test_ids_that_are_wrong_on_the_way_carry_no_robot_that_closes_its_loop(data: Callable[[str], Path]) -> None:
+    data("dlr")
+    config, log = open_run("dlr", None, ("association.gate=0.9999",))
+    run = km.record(build_slam(config, log), log, progress=False, pictures=False)
+    assert not run.history.carried()
+    assert len(run.landmarks.ids) == 576
 
 
 def test_a_batch_solution_has_no_observation_of_a_robot_that_was_elsewhere_nor_of_the_scan_that_placed_it() -> None:

@@ -19,6 +19,7 @@ from kalmark.diagnosis.effect import shape_without
 from kalmark.diagnosis.error_columns import DRIFT, LATE
 from kalmark.diagnosis.named_causes import OF_MAP, begin_s, cause_of
 from kalmark.diagnosis.onsets import without_onset
+from kalmark.diagnosis.single_ids import Filtered
 from kalmark.diagnosis.structural_causes import structural_causes
 from kalmark.diagnosis.trials import AT_ONCE, FITS, Fit, Trials, fit_of_run, likelihood_gain, options_of, with_cure
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
@@ -57,21 +58,21 @@ class _Taken(NamedTuple):
 def with_cures(
     run: Run, log: Log, verdict: Verdict, alarmed: bool, most: int, trials: Trials, *also: Finding,
     least: float = 0.0,
-) -> Verdict:  # fmt: skip
+) -> tuple[Verdict, Filtered | None]:  # fmt: skip
     """Return a verdict in which the small errors with which the log is likeliest are taken out by their cures.
 
     That is done one after the other, and what is left of one belongs to it: so far away the problem was not linear.
-    All together have to gain `least`.
+    All together have to gain `least`.  With it comes the log without them, None if none is taken out.
     """
     suspects = _suspects(run, verdict, TRIED)
     doubted = alarmed or worst_status(verdict.map, *verdict.robots.values()) != OK
     doubted |= fit_of_run(run).mean > MISFITS_ALL or bool(also)
     if not doubted and not any(f.name == LATE or f.begins for f in suspects):  # whose sizes are so far from linear
-        return verdict
+        return verdict, None
     tried = _errors_to_try(run, log, [*also, *suspects], most, trials)
     taken = _taken_out(run, log, verdict, tried, most, trials)
     if not taken.errors or taken.total < least:
-        return verdict
+        return verdict, None
     found = sorted(taken.errors.values(), key=lambda f: -f.gain)
     left = [c for c in taken.rest.causes if c.name not in [f.name for f in found]]
     first = [c.name for c in verdict.causes[: 0 if taken.partly else 1]]  # goes before them if they do not explain it
@@ -80,7 +81,7 @@ def with_cures(
         key=lambda c: c not in left or c.harmless or c.name not in first,
     )
     status = worst_status(verdict.map, shape_without(run, taken.run)[0], DOUBTFUL if taken.partly else OK)
-    return replace(verdict, map=status, causes=(*causes,))
+    return replace(verdict, map=status, causes=(*causes,)), Filtered(taken.run, taken.log)
 
 
 def _taken_out(run: Run, log: Log, verdict: Verdict, tried: Iterable[Finding], most: int, trials: Trials) -> _Taken:

@@ -9,15 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from kalmark.arrays import Array
-from kalmark.batch.batch_state import POSES, BatchState, Ints
+from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState, Ints
 from kalmark.batch.motion_chain import TURNING
 from kalmark.batch.problem import Factor
 from kalmark.diagnosis.linear import Linear
 from kalmark.geometry.angles import rotation
 from kalmark.geometry.rotations import matrix
+from kalmark.models.observe import MOUNT, sensor_pose
 from kalmark.results.measures import pose_error
 
 MOST_SCALE = 0.25  # beyond it the problem is not linear: of a scale, and of a mount's share of the way to what it sees
+MOST_TURN = math.pi / 2  # of a mount, rad
 SLOW_S = 1e-3  # least time between two poses
 LENGTHS = ("range", "distance")  # how columns of lengths begin
 ALL = "all sensors"
@@ -25,6 +27,8 @@ ALSO = " and "  # between the columns of wheels that have an error together
 DRIFT = "s/s"  # the unit of a clock that drifts
 LATE = "time_offset"
 SHARED = ("range_scale", "range_offset", "bearing_offset", LATE)  # errors of several sensors
+TURNED = "mount"  # a sensor that is turned
+ANGLES = {2: ("theta_rad",), 3: ("roll_deg", "pitch_deg", "yaw_deg")}  # keys of the turn of a mount, by axis
 
 Where = tuple[str, str]
 
@@ -117,6 +121,10 @@ def _of_sensor(
         first += dof
     yield LATE, factor.sensor, "s", math.inf, moving
     (observer, *_, seen), d = factor.term.blocks, state.d
+    if (observer.group, seen.group) == (POSES, LANDMARKS) and (d > 2 or not any(map(is_bearing, names))):
+        for key, turn in zip(ANGLES[d], _turns(factor, state), strict=True):
+            changed = np.nan_to_num(np.einsum("kij,kj->ki", E[:, :, : turn.shape[1]], turn))
+            yield TURNED, (*factor.sensor, key), "rad", MOST_TURN, changed
     if observer.group == POSES:
         poses = state.groups[POSES][observer.rows]
         axes, away = _axes(poses), state.groups[seen.group][seen.rows, :d] - poses[:, :d]
@@ -124,6 +132,26 @@ def _of_sensor(
         shifted = np.einsum("kij,kjc->kic", E[:, :, :d], axes)
         for k, name in enumerate(("x_m", "y_m", "z_m")[:d]):
             yield "mount_position", (*factor.sensor, name), "m", most, shifted[:, :, k]
+
+
+def is_bearing(column: str) -> bool:
+    """Return whether an offset of a column is a turn of its sensor, in the plane about its only axis."""
+    return column.startswith(("bearing", "normal", "azimuth"))
+
+
+def _turns(factor: Factor, state: BatchState) -> Iterator[Array]:
+    """Yield how robots would move (K, dof), about their sensor, to see what it sees if that turns by one radian.
+
+    In space that is about each axis of the robot.
+    """
+    mount = factor.view[MOUNT] if isinstance(factor.view, tuple) else factor.view.mount
+    poses, d = state.groups[POSES][factor.term.blocks[0].rows], state.d
+    arm = poses[:, :d] - np.array([sensor_pose(pose, mount)[0][:d] for pose in poses])
+    if d == 2:
+        yield np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(poses))])
+        return
+    for axis in _axes(poses).transpose(2, 0, 1):
+        yield np.column_stack([np.cross(axis, arm), axis])
 
 
 def _of_its_columns(
@@ -138,8 +166,7 @@ def _of_its_columns(
             yield "range_scale", of, "", MOST_SCALE, longer * mine
             yield "range_offset", of, "m", math.inf, one * mine
         elif name.endswith("_rad"):
-            turned = name.startswith(("normal", "azimuth"))
-            offset = "bearing_offset" if turned else f"{name.removesuffix('_rad')}_offset"
+            offset = "bearing_offset" if is_bearing(name) else f"{name.removesuffix('_rad')}_offset"
             yield offset, of, "rad", math.inf, one * mine
         elif longer[:, c].any() and not longer[:, :c].any():  # one scale of all columns
             scaled = [other for k, other in enumerate(names) if longer[:, k].any()]

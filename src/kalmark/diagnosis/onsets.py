@@ -13,18 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from kalmark.arrays import Array, Index
-from kalmark.batch.batch_state import LANDMARKS, POSES, BatchState
-from kalmark.batch.problem import Factor
 from kalmark.diagnosis.causes import LEAST_GAIN, LEAST_INFORMATION, SEEN, Finding, systematic
-from kalmark.diagnosis.error_columns import ALL, DRIFT, LATE, Column
+from kalmark.diagnosis.error_columns import ALL, DRIFT, LATE, MOST_TURN, TURNED, Column
 from kalmark.diagnosis.linear import Linear
 from kalmark.events import Control, Event, Scan, sort_key
-from kalmark.geometry.rotations import matrix
 from kalmark.logs.log import Log
-from kalmark.models.observe import MOUNT, sensor_pose
 from kalmark.results.run import Run
 
-TURNED = "mount"  # the cause that a sensor was turned
 STRETCHES, ROUNDS = 20, 4  # in which the time is looked for, and how often within the best of them
 TRIED = 3  # errors whose time is looked for
 ALONE = 0.9  # of what an error of its own in each stretch explains, the share that one in a part of the run has to
@@ -37,9 +32,8 @@ def find_onsets(linear: Linear, columns: list[Column], t_s: Array) -> list[Findi
     calibration drifts.  `p` counts that the times were looked for.
     """
     row_s, step_s = _times(linear, t_s)
-    turns = [column for column in turned_mounts(linear) if column.Z.any()]
-    turned = {column.of for column in turns}  # an offset of their angles is a turn of the mount
-    columns = [*(c for c in columns if c.unit != "rad" or c.of[:2] not in turned), *turns]
+    turned = {column.of[:2] for column in columns if column.name == TURNED}
+    columns = [_as_turn(c) for c in columns if c.name == TURNED or c.unit != "rad" or c.of[:2] not in turned]
     likely, found = list[tuple[float, Column]](), list[Finding]()
     edges = np.quantile(t_s, np.linspace(0.0, 1.0, STRETCHES, endpoint=False))
     for column in columns:
@@ -49,6 +43,13 @@ def find_onsets(linear: Linear, columns: list[Column], t_s: Array) -> list[Findi
     for _, column in sorted(likely, key=lambda one: -one[0])[:TRIED]:
         found += _passing(linear, column, t_s)
     return found
+
+
+def _as_turn(column: Column) -> Column:
+    """Return an offset of bearings as the turn of its mount that it is, in the plane, and other errors as they are."""
+    if column.name != "bearing_offset" or column.of[1] == ALL:
+        return column
+    return column._replace(name=TURNED, Z=-column.Z, most=MOST_TURN)
 
 
 def _times(linear: Linear, t_s: Array) -> tuple[Array, Array]:
@@ -79,35 +80,6 @@ def _passing(linear: Linear, column: Column, t_s: Array) -> Iterator[Finding]:
             begin_s = max(float(t_s[t_s < begin_s].max(initial=0.0)), begin_s - usual_s)
             end_s = float(t_s[t_s < end_s].max()) if end_s < math.inf else end_s
         yield replace(one, p=p, since_s=begin_s, until_s=end_s)
-
-
-def turned_mounts(linear: Linear) -> Iterator[Column]:
-    """Yield the turns of each sensor about the axis of the plane, or those of its robot."""
-    for f, factor in enumerate(linear.problem.factors):
-        if factor.sensor[1] and [b.group for b in factor.term.blocks] == [POSES, LANDMARKS]:
-            for turn in _turns(linear, f, factor):
-                yield Column(TURNED, factor.sensor, "rad", turn, np.zeros(len(linear.at.w)), math.pi / 2)
-
-
-def _turns(linear: Linear, f: int, factor: Factor) -> Iterator[Array]:
-    """Yield the change of the data (N,) by one radian of a mount: about the axis of the plane or those of the robot."""
-    E, factors = factor.term.at(linear.state)[1], linear.problem.factors
-    for axis in _axes(linear.state, factor):
-        parts = [np.zeros(other.R.shape[:2]) for other in factors]
-        parts[f] = np.nan_to_num(np.einsum("kij,kj->ki", E[:, :, : axis.shape[1]], axis))
-        yield linear.whitened(parts)
-
-
-def _axes(state: BatchState, factor: Factor) -> Iterator[Array]:
-    """Yield how a robot would move (K, dof), about its sensor, to see what the sensor sees if that turns."""
-    block, mount = factor.term.blocks[0], factor.view[MOUNT] if isinstance(factor.view, tuple) else factor.view.mount
-    poses = state.groups[POSES][block.rows]
-    arm = poses[:, : state.d] - np.array([sensor_pose(pose, mount)[0][: state.d] for pose in poses])
-    if state.d == 2:
-        yield np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(poses))])
-        return
-    for axis in np.array([matrix(pose[3:]) for pose in poses]).transpose(2, 0, 1):
-        yield np.column_stack([np.cross(axis, arm), axis])
 
 
 def _best_part(
@@ -184,8 +156,7 @@ def without_onset(run: Run, log: Log, finding: Finding) -> Log | None:
     begin_s, end_s = (first_s + (t or 0.0) for t in (finding.since_s, finding.until_s))
     is_control = rest[-1:] in (["scale"], ["offset"])
     names = of.motion.columns if is_control else of.sensors[second].sensor.columns if second in of.sensors else ()
-    wanted = [second] if is_control else ["bearing_rad"] if finding.name == TURNED else rest
-    k = [names.index(name) for name in wanted if name in names]
+    k = [names.index(name) for name in ([second] if is_control else rest) if name in names]
     if not (k or finding.name == LATE) or finding.name == "mount_position":
         return None
     each_s = np.diff([e.t_s for e in log.events if isinstance(e, Control) and e.robot == robot])

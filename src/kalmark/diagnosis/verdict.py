@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import takewhile
 
 from kalmark.diagnosis.batch_verdict import Verdict, judged
 from kalmark.diagnosis.blind import blind
@@ -11,8 +12,9 @@ from kalmark.diagnosis.cures import CURES, own_cure, steady_errors, with_cures
 from kalmark.diagnosis.effect import Effect, shape_without
 from kalmark.diagnosis.gross_mistakes import first_misfit, gross, likeliest, misfits_from
 from kalmark.diagnosis.lost import unchecked_ends
+from kalmark.diagnosis.mistakes import Mistake
 from kalmark.diagnosis.named_causes import COPIES, MISFIT, Cause, all_misfit, begin_s, cause_of_mistake
-from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS
+from kalmark.diagnosis.single_ids import MISPLACED, MOVED, OUTLIERS, find_wrong_ids
 from kalmark.diagnosis.structural_causes import readings_off, structural_causes, unfitting_measurements
 from kalmark.diagnosis.trials import AT_ONCE, FITS, Trials, detecting, fit_of_run, is_configured
 from kalmark.diagnosis.trials import MISFIT as MISFITS_ALL
@@ -101,28 +103,41 @@ def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
         noisy = any(cause.name.endswith("_sigma") and not cause.harmless for cause in verdict.causes)
         alone = likeliest(run, log, trials, first_misfit(run)) if noisy and not alarmed else None
         if alone is None:
-            return with_cures(run, log, verdict, alarmed, most, trials)
+            return with_cures(run, log, verdict, alarmed, most, trials)[0]
         found = alone, None
     mistake, without = found
     cause = cause_of_mistake(mistake)
     if mistake.of:
         error = Finding(mistake.name, mistake.of, mistake.gain, 0.0, mistake.value, unit=mistake.unit)
-        verdict = with_cures(run, log, judged(run, log, first, most, trials), alarmed, most, trials, error)
+        verdict, _ = with_cures(run, log, judged(run, log, first, most, trials), alarmed, most, trials, error)
         if CURES not in trials.left_out or mistake.name in [c.name for c in verdict.causes]:
             return verdict
         return replace(verdict, map=worst_status(verdict.map, DOUBTFUL), causes=(cause, *verdict.causes))
     if without is None:
         return Verdict(WRONG, (cause, *(c for c in first if c.name in (COPIES, "gap") or c in off)), AGAIN)
     verdict = judged(run, log, first, most, trials)
-    cured = with_cures(run, log, verdict, alarmed, most, trials, least=mistake.gain)
+    cured, after = with_cures(run, log, verdict, alarmed, most, trials, least=mistake.gain)
     others = verdict.search is not None and OUTLIERS not in [c.name for c in verdict.causes]
     untried = max((f.gain for f in steady_errors(verdict.search) if not own_cure(run, f)), default=0.0)
-    if cured is not verdict or untried > mistake.gain or (mistake.name == OUTLIERS and others):  # it explains more
+    if after is not None:  # they explain more, but perhaps not all of it
+        left = find_wrong_ids(*after, fit_of_run(after.run), trials)
+        if left is None or left[0].name in [c.name for c in cured.causes]:
+            return cured
+        return _with_mistake(cured, left[0], shape_without(after.run, left[1].run)[0])
+    if untried > mistake.gain or (mistake.name == OUTLIERS and others):  # it explains more
         return cured
     status, off_m = shape_without(run, without.run)
     rest = judged(*without, structural_causes(*without, off), most, trials)
     causes = replace(cause, harmless=cause.name == OUTLIERS and status == OK), *rest.causes
     return replace(rest, map=worst_status(status, rest.map), causes=causes, shift_m=max(rest.shift_m or 0.0, off_m))
+
+
+def _with_mistake(verdict: Verdict, mistake: Mistake, status: str) -> Verdict:
+    """Return a verdict with a mistake behind the causes that explain more; without it the map has the status."""
+    cause = replace(cause_of_mistake(mistake), harmless=mistake.name == OUTLIERS and status == OK)
+    first = [*takewhile(lambda one: one.score > mistake.gain, verdict.causes)]
+    causes = *first, cause, *verdict.causes[len(first) :]
+    return replace(verdict, map=worst_status(verdict.map, status), causes=causes)
 
 
 def _with_signs(run: Run, verdict: Verdict) -> Verdict:

@@ -212,13 +212,7 @@ def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constell
     area = 0.5 * float((np.conj(np.roll(corners, 1)) * corners).imag.sum())
     if area <= 0.0:
         return None
-    density, p = m / area, 0.0
-    edges, few = (look.near >= 0).sum() / 2, min(1.0, SAMPLE / m)
-    chance = min(density * math.pi * of.tolerance**2, 1.0)
-    for each in chain([chance], (_self_similarity(of, part) for part in found.pairs.T)):
-        p = max(p, 2.0 * float(edges**2 * betainc(few * k - 2, few * (m - k) + 1, each)))
-        if p > FALSE_ALARMS:
-            return None
+    density = m / area
     pairs = found.pairs.take(np.argsort(np.median(found.pairs, axis=0), kind="stable"), axis=1)  # the older first
     older, newer = of.z[pairs[:, 0]], of.z[pairs[:, 1]]
     T = fit(older, newer)
@@ -226,13 +220,19 @@ def _judged(look: _RepeatCandidates, found: _Constellation, all_: list[_Constell
         return None  # each part is the other one turned: the world is symmetric
     score, fits, agrees = _weighed(look, T, pairs, density)
     score += MISSED * found.missing
+    # as likely by chance: the ratio exceeds 1 over it as seldom; one that the covariance excludes is less likely yet
+    if score <= -math.log(FALSE_ALARMS if agrees else SURE):
+        return None
+    p, edges, few = 0.0, (look.near >= 0).sum() / 2, min(1.0, SAMPLE / m)
+    chance = min(density * math.pi * of.tolerance**2, 1.0)
+    for each in chain([chance], (_self_similarity(of, part) for part in found.pairs.T)):
+        p = max(p, 2.0 * float(edges**2 * betainc(few * k - 2, few * (m - k) + 1, each)))
+        if p > FALSE_ALARMS:
+            return None
     rivals = any(
         other is not found and 2 * len(other.pairs) > k and other.overlaps(found) and found.differs(other)
         for other in all_
     )
-    # as likely by chance: the ratio exceeds 1 over it as seldom; one that the covariance excludes is less likely yet
-    if score <= -math.log(FALSE_ALARMS if agrees else SURE):
-        return None
     named = [(look.names[a], look.names[b]) for a, b in pairs.tolist()]
     older, middle, b = (np.array([z.real, z.imag]) for z in (*of.z[pairs].mean(axis=0), T[1]))
     sure = bool(p <= SURE and fits and not rivals)

@@ -28,7 +28,7 @@ from kalmark.association.global_start import (
     locate_tags,
     rows_of,
 )
-from kalmark.association.relocalization import SAME_M, is_same_pose
+from kalmark.association.relocalization import SAME_M
 from kalmark.events import Id
 from kalmark.filter.estimators import Correction, Estimator, Update
 from kalmark.geometry.gaussian import gate
@@ -218,10 +218,10 @@ def locate(state: State, scan: ScanContext, of: Evidence, old: Known) -> Proposa
 
 
 def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
-    """Begin a second hypothesis where a constellation is one of old landmarks.
+    """Begin a second hypothesis where a constellation is one of old landmarks, and the robot is not.
 
-    If nothing shows that the robot is elsewhere, that is a place where it is not, since it left the old one, or a
-    likelier one than the last.
+    If nothing shows that the robot is elsewhere, that is one since it left the old place, or a likelier one than the
+    last.
     """
     name, r, tracks, by_shape = scan.event.robot, state.map.mean(scan.robot), state.tracks, of.ratio > -SURE
     if by_shape:
@@ -232,7 +232,7 @@ def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
         of.since_ns = onset_ns
     old = older(state, scan, of)
     found = locate(state, scan, of, old)
-    if found is None or (by_shape and (is_same_pose(found.T, scan.pose()) or found.gain < of.gain)):
+    if found is None or found.is_at(scan.pose()) or (by_shape and found.gain < of.gain):
         return
     other = state.pose_hypotheses[name] = PoseHypothesis.of(
         state.map, state.moving[name], state.blocks, scan.event.t_ns
