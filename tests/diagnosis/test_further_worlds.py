@@ -12,7 +12,7 @@ import pytest
 
 import kalmark as km
 from kalmark.arrays import Array
-from kalmark.config import build_slam
+from kalmark.config import build_slam, config_dict
 from kalmark.diagnosis.verdict import Verdict
 from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.logs.log import Log
@@ -111,6 +111,18 @@ def test_the_cause_is_named_first(case: str) -> None:
     assert verdict.map == status, verdict.causes
     assert re.search(evidence, verdict.causes[0].evidence), verdict.causes
     assert re.search(cure, verdict.causes[0].cure), verdict.causes[0].cure
+
+
+def test_a_camera_that_is_turned_against_its_mount_is_named_with_its_angles() -> None:
+    world = load_world("thick_cloister_stereo")
+    log = simulate(load_world("thick_cloister_stereo", ("robots.robot.sensors.stereo.mount.yaw_deg=-86",)), 0)
+    run = km.record(
+        build_slam(world.config(), log), log, config=config_dict(world.config()), progress=False, pictures=False
+    )
+    cause, *_ = km.diagnose(run).causes
+    assert cause.name == "mount" and cause.evidence.startswith("the sensor robot.stereo is turned by 4")
+    cure = re.search("robots.robot.sensors.stereo.mount.yaw_deg=(-[0-9.]*)", cause.cure)
+    assert cure is not None and float(cure[1]) == pytest.approx(-86.0, abs=0.5)
 
 
 def test_what_a_turn_that_is_too_large_makes_vanish_is_explained_by_it() -> None:
