@@ -185,3 +185,21 @@ def test_a_surveyed_point_is_a_point_for_a_sensor_of_bearings() -> None:
     assert slam.landmark_model(1) == km.landmarks.Point2D()
     (seen,) = slam.process(km.Scan(0, "r", "eye", [[-0.3]], [1])).observations
     assert seen.outcome == "associated"
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_lighthouses_lead_a_boat_whose_steps_are_longer_than_the_nearest_distance_of_the_prior(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    angles, motion = rng.uniform(-np.pi, np.pi, 12), km.motion.Odometry2D(0.1, 0.05, 0.01)
+    lights = rng.uniform(100.0, 400.0, (12, 1)) * np.column_stack([np.cos(angles), np.sin(angles)])
+    boat, pose = km.Slam(km.Robot("boat", motion, sensors={"eye": km.Mount(EYE)})), np.zeros(3)
+    for k in range(240):
+        u = np.array([4.0, 0.0, 0.08])  # m, m, rad: rounds of 50 m
+        pose = compose(pose, u)[0]
+        boat.process(km.Control(float(k), "boat", u + rng.normal(size=3) * [0.1, 0.05, 0.01]))
+        bearings = km.geometry.observe(pose, lights)[0][:, 1:]
+        report = boat.process(km.Scan(float(k), "boat", "eye", bearings + rng.normal(size=(12, 1)) * DEG, range(12)))
+        assert not any(o.outcome == "rejected" for o in report.observations)
+    off = motion.space.pose.minus(boat.mean("boat")[:3], pose)
+    assert off @ np.linalg.solve(boat.covariance("boat")[:3, :3], off) < gate(0.999, 3)
+    assert np.linalg.norm(off[:2]) < 3.0

@@ -62,9 +62,10 @@ def gross(run: Run, log: Log, trials: Trials, alarmed: bool = False) -> tuple[Mi
         return found, None
     now = fit_of_run(run)
     of_ids = find_wrong_ids(run, log, now, trials)
-    explained = of_ids is not None and fit_of_run(of_ids[1].run).mean < FITS
+    outlying = of_ids is not None and of_ids[0].name == OUTLIERS  # which any mistake looks like
+    explained = of_ids is not None and not outlying and fit_of_run(of_ids[1].run).mean < FITS
     first = None if explained else misfits_from(now)
-    fits = now.mean < MISFIT and not run.stopped and first is None
+    fits = now.mean < MISFIT and not run.stopped and first is None and not outlying
     about = first_misfit(run)
     alone = None if fits and not alarmed else likeliest(run, log, trials, about)
     if alone is not None and of_ids is not None and about is None:  # found in the first events, compared in all

@@ -190,14 +190,15 @@ class Trials:
         none, *left = (Trial(self, log, events, change) for change in changes)
         now, whole, before = UNUSED if none.run() is None else none.fit, self.work_of(events), 0.0
         left = left if _misfit(now) > SURELY else []
-        for share in SHARES:
-            most = max(1, int((self.work - end) / (whole * (share - before) + PART)))
+        for k, share in enumerate(SHARES):  # each part after the first has as much of the budget
+            paid = (self.work - end) / (len(SHARES) - k) / (whole * (share - before) + PART)
+            most = max(1, int(paid)) if k else len(left)
             likeliest = sorted(left, key=lambda one: -likelihood_gain(now, one.fit))[:most]
             left = [one for one in left if one in likeliest]
             for one in track(left, f"mistakes in {share:.0%} of the first events", show=self.progress):
                 one.run(share)
             left = [one for one in left if len(one.fit.values)]
-            left = [left[k] for k in _in_race(now, [one.fit for one in left], 1.0 / share - 1.0)]
+            left = [left[i] for i in _in_race(now, [one.fit for one in left], 1.0 / share - 1.0)]
             before = share
         made = [(one.change, likelihood_gain(now, one.fit)) for one in left]
         return [change._replace(gain=gain, since_s=events[0].t_s) for change, gain in made]

@@ -6,6 +6,9 @@ A ray is seen along v = h - rho t, t the way from its anchor to the sensor.
 noise, and at that estimate the Jacobian finds a depth, in each scan a little more.  So a ray is started again where
 rho, with what the measurement adds beyond such noise, still leaves the length of v open: there no linearisation holds.
 
+*A way beyond the nearest landmark of the prior* bends a first correction as much: from a boat that moves by 4 m between
+two bearings a landmark that is expected at 2 m, and stands at 300, is seen in another direction altogether.
+
 *A mount in the map* whose camera turns about its robot has its lever arm in t.  While rho is open, too, images measure
 the product of two unknowns: their likelihood of the mount then is far from Gaussian, with its rotation it can have two
 maxima, and no later image repairs a correction towards the wrong one.  docs/bearing_only.md.
@@ -15,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kalmark.arrays import Flags, Index
+from kalmark.arrays import Array, Flags, Index
 from kalmark.geometry.rotations import skew
 from kalmark.models.landmarks import AnchoredHomogeneous
 from kalmark.models.observe import linearize
@@ -27,14 +30,15 @@ from kalmark.tracks.scan import ScanContext
 SHARE = 0.05  # of the way from its anchor that a mount may leave open
 
 
-def bent_rays(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:
+def bent_rays(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> tuple[Flags, Array]:
     """Return which observations `rows` (K,), of the blocks `slots`, are of rays along which no linearisation holds.
 
     With what they add to it, sigma of rho still lets the length of v = h - rho t change by more than a `SHARE`.  They
     add |R^-1/2 E_rho|^2, less what E_rho would be of a ray in the direction of t that is off by their noise, |t| / |v|.
+    With them come the ways |t| (K,) of those that sigma of rho moves by more than |h|, 0 of others.
     """
     if not isinstance(model.landmark, Reparametrizable):
-        return np.zeros(len(rows), dtype=np.bool_)
+        return np.zeros(len(rows), dtype=np.bool_), np.zeros(len(rows))
     map_, d = scan.map, scan.dimensions
     l = map_.means(slots, model.d)
     v, _, V_l = model.landmark.seen_from(scan.pose(), l)
@@ -50,7 +54,8 @@ def bent_rays(scan: ScanContext, model: ObservationModel, slots: Index, rows: li
         by_noise = linearity.SIGMAS * np.linalg.norm(t, axis=1) / np.linalg.norm(v, axis=1)
         added = np.maximum(np.sqrt(np.sum(E_rho * R_E, axis=1)) - by_noise, 0.0) ** 2
         found = variance > least**2 * (1.0 + variance * added)
-    return found
+    way, h = np.linalg.norm(t, axis=1), np.linalg.norm(v - l[:, -1:] * t, axis=1)
+    return found, np.where(linearity.SIGMAS * np.sqrt(variance) * way > h, way, 0.0)
 
 
 def rays_without_baseline(scan: ScanContext, model: ObservationModel, slots: Index, rows: list[int]) -> Flags:

@@ -351,7 +351,7 @@ class Slam(Estimate):
         names = [name for name, _ in decisions]
         groups = state.tracks.by_model(scan.channel, names, scan.event.robot)
         exact = correct_by_known(state, scan, policy, decisions) if state.tracks.known else []
-        again = starting.take_open_rays(state, scan, groups, decisions) if policy.restarts else []
+        again = starting.take_open_rays(state, scan, groups, decisions) if policy.restarts else {}
         judged, found = correct(state, scan, policy, groups, decisions)
         judged = exact + judged
         if state.sums:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -75,24 +75,30 @@ def _add_landmark(state: State, scan: ScanContext, policy: Policy, k: int, name:
 
 def take_open_rays(
     state: State, scan: ScanContext, groups: list[tuple[ObservationModel, list[int]]], decisions: Sequence[Decision]
-) -> list[int]:  # fmt: skip
-    """Return the observations of rays whose depth stays open, and take them out of the groups to be fused."""
-    found: list[int] = []
+) -> dict[int, float]:  # fmt: skip
+    """Return the observations of rays whose depth stays open, and take them out of the groups to be fused.
+
+    With each comes the way from its anchor if that is beyond the nearest landmark of its prior, 0 if it is not.
+    """
+    found = dict[int, float]()
     for model, rows in groups:
         slots = state.tracks.slots_of([decisions[k][0] for k in rows])
-        is_open = ray_restarts.bent_rays(scan, model, slots, rows)
+        is_open, ways = ray_restarts.bent_rays(scan, model, slots, rows)
         if scan.channel.mount >= 0:
             is_open |= ray_restarts.rays_without_baseline(scan, model, slots, rows)
-        found += [k for k, is_one in zip(rows, is_open.tolist(), strict=True) if is_one]
+        each = zip(rows, (is_open | (ways > 0.0)).tolist(), ways.tolist(), strict=True)
+        found |= {k: way for k, is_one, way in each if is_one}
         rows[:] = [k for k in rows if k not in found]
     return found
 
 
-def restart(state: State, scan: ScanContext, rows: Sequence[int], decisions: Sequence[Decision]) -> list[Observation]:
+def restart(
+    state: State, scan: ScanContext, rows: Mapping[int, float], decisions: Sequence[Decision]
+) -> list[Observation]:  # fmt: skip
     """Start the landmarks of these observations again: after a correction, for the camera is on their new anchors."""
     found, names = [], [cast("Id", decisions[k][0]) for k in rows]
-    for k, name in zip(rows, names, strict=True):
-        start, track = scan.start_of(k), state.tracks.confirmed[name]
+    for (k, way), name in zip(rows.items(), names, strict=True):
+        start, track = scan.start_of(k, way=way), state.tracks.confirmed[name]
         state.map.remove(track.slot)
         state.tracks.replace(track, state.add(start), track.model)
         found.append(Observation(k, scan.ids[k], "new", track.id, None, AGAIN))

@@ -321,19 +321,24 @@ class Channel:
         return model.predict(*map_.marginal(robot, self.second(robot), slots), y, R)
 
     def landmark_of(
-        self, map_: Map, robot: int, y: Array, R: Array, own_noise: bool, which: int = 0, id_: Id | None = None
-    ) -> tuple[Array, Array, Array]:
+        self, map_: Map, robot: int, y: Array, R: Array, own_noise: bool, which: int = 0, id_: Id | None = None,
+        way: float = 0.0,
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
         """Return the landmark l (n,) that explains a measurement y (1, m) with the noise R, L_h and Q.  [S] (32)-(35).
 
         L_h (., 3 or more) is with respect to the observer block, Q = L_y R L_y' + prior.  Of two landmarks that explain
-        it, `which` is taken.
+        it, `which` is taken.  Of an unknown depth the nearest landmark of the prior is at least at twice a `way`.
         """
         observer = self.observer(map_, robot)
         r, mount, own = self.split(observer)
         sensor = self.calibrated(map_)
         v, V_y = (a[:, which] for a in sensor.both(y)[:2]) if self.is_ambiguous else sensor.invert(y)
         rho = self.rho.get(id_) if id_ is not None else None
-        landmark = self.landmark if rho is None else replace(self.landmark, prior_rho_per_m=rho)  # type: ignore[type-var]
+        landmark: Any = self.landmark if rho is None else replace(self.landmark, prior_rho_per_m=rho)  # type: ignore[type-var]
+        if way > 0.0:
+            rho, sigma = landmark.prior_rho_per_m, landmark.sigma_rho_per_m
+            by = min(0.5 / (way * (rho + 2.0 * sigma)), 1.0)
+            landmark = replace(landmark, prior_rho_per_m=by * rho, sigma_rho_per_m=by * sigma)
         l, L_r, L_s, L_y, prior = landmark_at(r, mount, landmark, v, V_y, self.finds_depth)
         if self.noise_at is not None and not own_noise:
             R = self.noise_at(self.sensor.invert(y)[0])[0]

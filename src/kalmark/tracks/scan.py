@@ -169,13 +169,16 @@ class ScanContext:
             return R
         return model.weighed(*self.map.marginal(self.robot, self.channel.second(self.robot), slots), y, R, how)
 
-    def start_of(self, k: int, which: int = 0) -> Start:
-        """Return the landmark that explains the k-th observation; of two that do, `which`."""
+    def start_of(self, k: int, which: int = 0, way: float = 0.0) -> Start:
+        """Return the landmark that explains the k-th observation; of two that do, `which`.
+
+        The nearest one of a prior of its depth is at least at twice a `way`.
+        """
         R = self.R[k]
         if self.event.cov is not None and self.channel.start_noise is not None:
             R = np.broadcast_to(self.event.cov, (len(self.y), *self.event.cov.shape[-2:]))[k]
         l, L_h, Q = self.channel.landmark_of(
-            self.map, self.robot, self.y[k : k + 1], R, self.own_noise, which, self.ids[k]
+            self.map, self.robot, self.y[k : k + 1], R, self.own_noise, which, self.ids[k], way
         )
         G = self.estimator.pose_jacobian(self.map, self.robot, L_h)
         return Start(self.channel.landmark.space, l, self.channel.parts(self.map, self.robot), G, Q)
