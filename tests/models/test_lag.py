@@ -10,7 +10,7 @@ import pytest
 import kalmark as km
 from kalmark.arrays import Array
 from kalmark.geometry.spaces import SE2, SE3, Space, mount_space
-from kalmark.models.observe import FOLLOW, MOUNTS_AGO, PythonView, linearize, sensor_pose, view_of
+from kalmark.models.observe import PythonView, follow_twist, linearize, mount_ago, sensor_pose, view_of
 from kalmark.models.protocols import parameter_covariance
 from kalmark.models.state_view import twist_between
 
@@ -49,7 +49,7 @@ def test_a_mount_some_time_ago_is_the_one_that_the_twist_has_moved_since(pose: S
     twist, here = past[1 : 1 + pose.dof], np.zeros(3) if pose is SE2 else np.eye(7)[6]
     s = pose.plus(here, np.linspace(0.1, 0.3, pose.dof))
     still = np.concatenate([[0.0], twist, here])  # where it is now
-    B = MOUNTS_AGO[pose.size](s, 0.2, still)[0]
-    moved = FOLLOW[pose.dof](twist, 0.2)[0]
+    B = mount_ago(s, 0.2, still)[0]
+    moved = follow_twist(twist, 0.2)[0]
     np.testing.assert_allclose(sensor_pose(moved, B)[0], s, atol=1e-12)
     np.testing.assert_allclose(twist_between(here, moved, 0.2), twist, atol=1e-9)

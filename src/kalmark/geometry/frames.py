@@ -119,6 +119,18 @@ def product(A: Array, B: Array) -> Array:
     return out
 
 
+@compiled
+def multiply_many(A: Array, B: Array) -> Array:
+    """Return the products (K, a, c) of the first b columns of K matrices (K, a, b or more) with (K, b, c)."""
+    C = np.zeros((len(A), A.shape[1], B.shape[2]))
+    for i in range(len(A)):
+        for a in range(A.shape[1]):
+            for b in range(B.shape[1]):
+                for c in range(B.shape[2]):
+                    C[i, a, c] += A[i, a, b] * B[i, b, c]
+    return C
+
+
 def one_or_many(function: Callable[..., tuple[Array, ...]], *given: Any) -> Any:
     """Call a function of K rows, its last argument (K, n), or of a single one (n,) given without that dimension."""
     *frame, p = (np.ascontiguousarray(each, dtype=np.float64) for each in given)

@@ -28,6 +28,17 @@ def moved_with(pose: Array, before: Array, after: Array) -> Array:
 
 
 @compiled
+def compose_poses(a: Array, b: Array) -> tuple[Array, Array, Array]:
+    """Return c = a o b of poses (3,) or (7,), C_a and C_b (3, 3) or (6, 6); `b` alone has the size of a pose.
+
+    >>> c, C_a, C_b = km.geometry.pose_frames.compose_poses(np.array([1.0, 2.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    >>> c.round(3)
+    array([2., 2., 0.])
+    """
+    return frames.compose(a, b) if len(b) == 3 else frames3d.compose(a, b)
+
+
+@compiled
 def body_axes(state: Array, size: int) -> Array:
     """Return the matrix (size, size) from errors in the frame of a robot to the world's, by its state.
 

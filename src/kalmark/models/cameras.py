@@ -34,7 +34,7 @@ from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.errors import ModelError
 from kalmark.geometry.directions import unit_many
-from kalmark.models.landmarks3d import multiply_many
+from kalmark.geometry.frames import multiply_many
 
 RADIAL, RADTAN, EQUIDISTANT, OMNI, TSAI, DAVISON, FOV = range(7)
 LENSES = {

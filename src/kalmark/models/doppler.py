@@ -31,12 +31,7 @@ def expect_range_rate(code: int, par: Array, angular: Flags, v: Array, y: Array)
     k, d, m = len(v), v.shape[1] // 2, y.shape[1]
     e, E_v, p = np.empty((k, m)), np.zeros((k, m, 2 * d)), v[:, :d].copy()
     if m > 1:
-        place, Y_p = scan_many(p) if d == 2 else spherical_many(p)
-        for i in range(k):
-            for a in range(d):
-                e[i, a] = place[i, a]
-                for b in range(d):
-                    E_v[i, a, b] = Y_p[i, a, b]
+        e[:, :d], E_v[:, :d, :d] = scan_many(p) if d == 2 else spherical_many(p)
     for i in range(k):
         square, along = NEAREST_M * NEAREST_M, 0.0
         for a in range(d):

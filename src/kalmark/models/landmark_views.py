@@ -90,38 +90,24 @@ def components(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tup
 @compiled
 def camera(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return e, z (K, 2), E_v (K, 2, d) of the pixels of a camera, `code` its lens."""
-    k, ray = len(v), np.empty((len(v), 3))
-    for i in range(k):
-        for b in range(3):
-            ray[i, b] = v[i, b]
-    e, E_ray = cameras.project(code, ray, par)
-    z, E_v = np.empty((k, 2)), np.zeros((k, 2, v.shape[1]))  # a pixel does not depend on its ray's inverse distance
-    for i in range(k):
-        for a in range(2):
-            z[i, a] = y[i, a] - e[i, a]
-            for b in range(3):
-                E_v[i, a, b] = E_ray[i, a, b]
-    return e, z, E_v
+    e, E_ray = cameras.project(code, v[:, :3].copy(), par)
+    E_v = np.zeros((len(v), 2, v.shape[1]))  # a pixel does not depend on its ray's inverse distance
+    E_v[:, :, :3] = E_ray
+    return e, y - e, E_v
 
 
 @compiled
 def pixel_depth(code: int, par: Array, angular: Flags, v: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return e, z (K, 3), E_v (K, 3, d) of pixels of a camera, `code` its lens, with 1 / depth along its axis."""
-    k, d = len(v), v.shape[1]
-    e, z, E_v = np.empty((k, 3)), np.empty((k, 3)), np.zeros((k, 3, d))
-    pixel, shift, E_pixel = camera(code, par, angular, v, y)
+    k, d = v.shape
+    e, E_v = np.empty((k, 3)), np.zeros((k, 3, d))
+    e[:, :2], _, E_v[:, :2] = camera(code, par, angular, v, y[:, :2].copy())
     for i in range(k):
         rho = v[i, 3] if d == 4 else 1.0  # v is (x, y, z), or a ray with its inverse distance
-        for a in range(2):
-            e[i, a], z[i, a] = pixel[i, a], shift[i, a]
-            for b in range(d):
-                E_v[i, a, b] = E_pixel[i, a, b]
-        e[i, 2] = rho / v[i, 2]
-        z[i, 2] = y[i, 2] - e[i, 2]
-        E_v[i, 2, 2] = -rho / (v[i, 2] * v[i, 2])
+        e[i, 2], E_v[i, 2, 2] = rho / v[i, 2], -rho / (v[i, 2] * v[i, 2])
         if d == 4:
             E_v[i, 2, 3] = 1.0 / v[i, 2]
-    return e, z, E_v
+    return e, y - e, E_v
 
 
 @compiled

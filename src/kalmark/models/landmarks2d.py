@@ -22,7 +22,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.angles import wrap
-from kalmark.geometry.frames import from_frame_many, to_frame_many
+from kalmark.geometry.frames import from_frame_many, multiply_many, to_frame_many
 
 
 @compiled
@@ -144,12 +144,7 @@ def inverse_depth_as_point(T: Array, l: Array) -> tuple[Array, Array, Array]:
 def through_point(T: Array, p: Array, P_l: Array) -> tuple[Array, Array, Array]:
     """Return points p (K, 2) in the frame T, v (K, 2), V_T (K, 2, 3) and V_l (K, 2, 4), by their P_l (K, 2, 4)."""
     v, V_T, V_p = to_frame_many(T, p)
-    V_l = np.empty((len(p), 2, 4))
-    for i in range(len(p)):
-        for a in range(2):
-            for b in range(4):
-                V_l[i, a, b] = V_p[i, a, 0] * P_l[i, 0, b] + V_p[i, a, 1] * P_l[i, 1, b]
-    return v, V_T, V_l
+    return v, V_T, multiply_many(V_p, P_l)
 
 
 @compiled

@@ -25,6 +25,7 @@ import numpy as np
 from kalmark.arrays import Array
 from kalmark.compiled import compiled
 from kalmark.geometry.directions import direction_many, spherical_many, unit_many
+from kalmark.geometry.frames import multiply_many
 from kalmark.geometry.frames3d import from_frame_many, to_frame_many
 from kalmark.geometry.rotations import matrix
 
@@ -64,28 +65,10 @@ def inverse_depth_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
 @compiled
 def homogeneous_seen_from(T: Array, l: Array) -> tuple[Array, Array, Array]:
     """Return the rays v (K, 3) to homogeneous points l (K, 4), V_T (K, 3, 6) and V_l (K, 3, 4)."""
-    anchored, V_l = np.zeros((len(l), 7)), np.empty((len(l), 3, 4))  # at the origin
-    for i in range(len(l)):
-        for a in range(4):
-            anchored[i, 3 + a] = l[i, a]
+    anchored = np.zeros((len(l), 7))  # at the origin
+    anchored[:, 3:] = l
     v, V_T, V_anchored = anchored_seen_from(T, anchored)
-    for i in range(len(l)):
-        for a in range(3):
-            for b in range(4):
-                V_l[i, a, b] = V_anchored[i, a, 3 + b]
-    return v, V_T, V_l
-
-
-@compiled
-def multiply_many(A: Array, B: Array) -> Array:
-    """Return the products (K, a, c) of the first b columns of K matrices (K, a, b or more) with (K, b, c)."""
-    C = np.zeros((len(A), A.shape[1], B.shape[2]))
-    for i in range(len(A)):
-        for a in range(A.shape[1]):
-            for b in range(B.shape[1]):
-                for c in range(B.shape[2]):
-                    C[i, a, c] += A[i, a, b] * B[i, b, c]
-    return C
+    return v, V_T, V_anchored[:, :, 3:].copy()
 
 
 @compiled
@@ -117,13 +100,8 @@ def anchored_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Array, 
     k = len(ray)
     m, M_theta, M_ray = world_rays(T, ray)
     l, L_T, L_ray, L_rho = np.empty((k, 7)), np.zeros((k, 7, 6)), np.zeros((k, 7, 3)), np.zeros((k, 7, 1))
-    for i in range(k):
-        l[i, 6] = rho[i]
-        L_rho[i, 6, 0] = 1.0
-        for a in range(3):
-            l[i, a], l[i, 3 + a], L_T[i, a, a] = T[a], m[i, a], 1.0
-            for b in range(3):
-                L_T[i, 3 + a, 3 + b], L_ray[i, 3 + a, b] = M_theta[i, a, b], M_ray[i, a, b]
+    l[:, :3], l[:, 3:6], l[:, 6] = T[:3], m, rho
+    L_T[:, :3, :3], L_T[:, 3:6, 3:], L_ray[:, 3:6], L_rho[:, 6] = np.eye(3), M_theta, M_ray, 1.0
     return l, L_T, L_ray, L_rho
 
 
@@ -147,13 +125,11 @@ def homogeneous_from_view(T: Array, ray: Array, rho: Array) -> tuple[Array, Arra
     k = len(ray)
     m, M_theta, M_ray = world_rays(T, ray)
     l, L_T, L_ray, L_rho = np.empty((k, 4)), np.zeros((k, 4, 6)), np.zeros((k, 4, 3)), np.zeros((k, 4, 1))
+    l[:, 3], L_T[:, :3, 3:], L_ray[:, :3], L_rho[:, 3] = rho, M_theta, M_ray, 1.0
     for i in range(k):
-        l[i, 3], L_rho[i, 3, 0] = rho[i], 1.0
         for a in range(3):
             l[i, a] = m[i, a] + rho[i] * T[a]
             L_T[i, a, a], L_rho[i, a, 0] = rho[i], T[a]
-            for b in range(3):
-                L_T[i, a, 3 + b], L_ray[i, a, b] = M_theta[i, a, b], M_ray[i, a, b]
     return l, L_T, L_ray, L_rho
 
 
@@ -163,10 +139,7 @@ def inverse_depth_to_anchored(l: Array) -> tuple[Array, Array]:
     m, M_a = direction_many(l[:, 3:5])
     h, H_l = np.empty((len(l), 7)), np.zeros((len(l), 7, 6))
     h[:, :3], h[:, 3:6], h[:, 6] = l[:, :3], m, l[:, 5]
-    H_l[:, 3:6, 3:5] = M_a
-    for a in range(3):
-        H_l[:, a, a] = 1.0
-    H_l[:, 6, 5] = 1.0
+    H_l[:, :3, :3], H_l[:, 3:6, 3:5], H_l[:, 6, 5] = np.eye(3), M_a, 1.0
     return h, H_l
 
 

@@ -32,9 +32,10 @@ import numpy as np
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import compiled
 from kalmark.geometry.directions import unit_many
+from kalmark.geometry.frames import multiply_many
 from kalmark.geometry.frames3d import to_frame_many, turned_rates
 from kalmark.geometry.rotations import matrix, skew
-from kalmark.models.landmarks3d import anchored_seen_from, homogeneous_seen_from, inverse_depth_seen_from, multiply_many
+from kalmark.models.landmarks3d import anchored_seen_from, homogeneous_seen_from, inverse_depth_seen_from
 
 PLUECKER_ABSCISSAS_M = (-8.0, 8.0)  # of a new line.  [TB]
 POINT_ABSCISSAS = (0.0, 1.0)

@@ -31,14 +31,13 @@ from numba.extending import overload
 from kalmark.arrays import Array, Flags
 from kalmark.compiled import address_of, by_address, compiled, form_for, signature_of
 from kalmark.declare import built_in
-from kalmark.geometry import frames3d
 from kalmark.geometry.angles import exponential_v, wrap
-from kalmark.geometry.frames import compose
+from kalmark.geometry.frames import multiply_many
+from kalmark.geometry.pose_frames import compose_poses
 from kalmark.geometry.rotations import exp, left_jacobian, matrix
 from kalmark.geometry.spaces import Space
 from kalmark.models import landmark_views, landmarks, sensors
 from kalmark.models.landmark_views import EXPECT, LOOK, VARY, residual
-from kalmark.models.landmarks3d import multiply_many
 from kalmark.models.protocols import (
     TWIST,
     Completing,
@@ -53,27 +52,26 @@ from kalmark.models.protocols import (
 )
 from kalmark.models.state_view import CHAIN, CHAINS, VELOCITY, call_chain, seen, sees_state, velocity_of
 
-View = tuple[int, int, int, int, int, int, int, int, int, Array, Array, Flags, int, Array]
-# addresses of a linearizer, its `links`, `compose`, the chain of a state (0: none), the landmark's `look` (0: none),
-# the sensor's `expected`, its `varied` (0: its parameters are known), the motion's `velocity` (0: the state has none);
+View = tuple[int, int, int, int, int, int, int, int, Array, Array, Flags, int, Array]
+# addresses of a linearizer, its `links`, the chain of a state (0: none), the landmark's `look` (0: none), the sensor's
+# `expected`, its `varied` (0: its parameters are known), the motion's `velocity` (0: the state has none);
 # then the sensor's code, mount, parameters (of one that sees its velocity: the time since the last scan and the
 # control), angles; then the mount some time ago (0: without a lag), and the past of the robot
-VIEW = "Tuple((i8, i8, i8, i8, i8, i8, i8, i8, i8, f8[::1], f8[::1], b1[::1], i8, f8[::1]))"
+VIEW = "Tuple((i8, i8, i8, i8, i8, i8, i8, i8, f8[::1], f8[::1], b1[::1], i8, f8[::1]))"
 LINEARIZE = signature_of(
     f"Tuple((f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
-SENSOR_AT = signature_of("Tuple((f8[::1], f8[:, ::1]))(i8, f8[::1], i8, f8[::1])")
-COMPOSE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1])")
+SENSOR_AT = signature_of("Tuple((f8[::1], f8[:, ::1]))(f8[::1], i8, f8[::1])")
 MOUNT_AGO = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8, f8[::1])")
 # of view, head, landmarks l and the given block: v (K, d), V_T (K, d, n) of what is between, T_h (n, h), V_l (K, d, n)
 LINKS = signature_of(
     f"Tuple((f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]))({VIEW}, f8[::1], f8[:, ::1], f8[:, ::1])"
 )
 call_linearize, call_sensor_at = by_address(LINEARIZE), by_address(SENSOR_AT)
-call_compose, call_links, call_mount_ago = by_address(COMPOSE), by_address(LINKS), by_address(MOUNT_AGO)
-MOUNT: Final = 9  # where a view has the mount,
-AGO: Final = 12  # the mount some time ago,
-PAST: Final = 13  # and the past of its robot
+call_links, call_mount_ago = by_address(LINKS), by_address(MOUNT_AGO)
+MOUNT: Final = 8  # where a view has the mount,
+AGO: Final = 11  # the mount some time ago,
+PAST: Final = 12  # and the past of its robot
 
 # of the state r (size,), the control u (m,), parameters and seconds: the new r, R_r (dof, dof), R_u (dof, m)
 MOVE = signature_of("Tuple((f8[::1], f8[:, ::1], f8[:, ::1]))(f8[::1], f8[::1], f8[::1], f8)")
@@ -81,12 +79,9 @@ call_move = by_address(MOVE)
 
 Links = tuple[Array, Array, Array, Array]
 NOTHING = np.zeros(0)
-COMPOSES = {3: compose, 7: frames3d.compose}  # by the size of a pose
 
 
-def sensor_pose(r: Array, mount: Array) -> tuple[Array, Array, Array]:
-    """Return the sensor's pose T = r o mount with T_r and T_s, in the plane (3,) or in space (7,)."""
-    return COMPOSES[len(r)](r, mount)
+sensor_pose = compose_poses  # T = r o mount with T_r and T_s, in the plane (3,) or in space (7,)
 
 
 @compiled
@@ -111,28 +106,21 @@ def follow_in_space(twist: Array, seconds: float) -> tuple[Array, Array]:
 
 
 @compiled
-def mount_ago_in_plane(s: Array, lag_s: float, past: Array) -> tuple[Array, Array, Array]:
-    """Return where a mount s (3,) was `lag_s` ago: B (3,) in the frame that its robot has now, B_s and B_lag (3, 1).
-
-    B = r0 o exp((t0 - lag) w) o s: `past` (7,) has the lag t0, the twist w about it and the pose r0 of the robot then.
-    """
-    d, d_t = follow_in_plane(past[1:4].copy(), past[0] - lag_s)
-    D, _, D_d = compose(past[4:].copy(), d)
-    B, B_D, B_s = compose(D, s)
-    return B, B_s, -(B_D @ D_d @ d_t)
+def follow_twist(twist: Array, seconds: float) -> tuple[Array, Array]:
+    """Return the pose d (3 or 7,) to which a constant twist (3 or 6,) leads in some seconds, and d_t (3 or 6, 1)."""
+    return follow_in_plane(twist, seconds) if len(twist) == 3 else follow_in_space(twist, seconds)
 
 
 @compiled
-def mount_ago_in_space(s: Array, lag_s: float, past: Array) -> tuple[Array, Array, Array]:
-    """Return where a mount s (7,) was `lag_s` ago, of a `past` (14,): B (7,), B_s and B_lag (6, 1)."""
-    d, d_t = follow_in_space(past[1:7].copy(), past[0] - lag_s)
-    D, _, D_d = frames3d.compose(past[7:].copy(), d)
-    B, B_D, B_s = frames3d.compose(D, s)
+def mount_ago(s: Array, lag_s: float, past: Array) -> tuple[Array, Array, Array]:
+    """Return where a mount s (3 or 7,) was `lag_s` ago: B in the frame that its robot has now, B_s and B_lag.
+
+    B = r0 o exp((t0 - lag) w) o s: `past` (7 or 14,) has the lag t0, the twist w about it and the robot's pose r0 then.
+    """
+    d, d_t = follow_twist(past[1 : len(past) - len(s)].copy(), past[0] - lag_s)
+    D, _, D_d = compose_poses(past[len(past) - len(s) :].copy(), d)
+    B, B_D, B_s = compose_poses(D, s)
     return B, B_s, -(B_D @ D_d @ d_t)
-
-
-FOLLOW = {3: follow_in_plane, 6: follow_in_space}  # by the size of a twist
-MOUNTS_AGO = {3: mount_ago_in_plane, 7: mount_ago_in_space}  # by the size of a pose
 
 
 def expectation(r: Array, mount: Array, sensor: Sensor, landmark: Landmark, l: Array) -> tuple[Array, ...]:
@@ -175,7 +163,7 @@ class PythonView:
     """The chain of a user's sensor, landmark or motion, evaluated in Python; without a landmark it is of the state.
 
     `since` (1 + k,) of a sensor that sees its own velocity: the seconds since its last scan and the control in force.
-    `past` (7 or 14,) is that of the robot (`mount_ago_in_plane`), of a sensor whose lag is in the map; else (0,).
+    `past` (7 or 14,) is that of the robot (`mount_ago`), of a sensor whose lag is in the map; else (0,).
     """
 
     sensor: Any
@@ -199,7 +187,7 @@ class PythonView:
         if len(behind) and not self.moving:
             s, own = behind[:pose], behind[pose:]
         if len(self.past):
-            s, B_s, B_lag = MOUNTS_AGO[pose](s, own[0], self.past)
+            s, B_s, B_lag = mount_ago(s, own[0], self.past)
             own, s_b = own[1:], np.concatenate([B_s, B_lag], axis=1)
         if len(own):
             sensor = sensor.with_parameters(own)
@@ -248,7 +236,7 @@ def view_of(
     (7 or 14,) of its robot is read at each scan of a sensor whose lag is in the map.
     """
     angular = np.array(sensor.angular, dtype=np.bool_)
-    links, chains, of_state = links_of(sensor, landmark, motion)
+    links, chain, of_state = links_of(sensor, landmark, motion)
     if not is_built_in(sensor, landmark) or (of_state and type(motion) not in built_in("motion")):
         return PythonView(sensor, landmark, mount, angular, motion, since, past)
     known, numbers = parameter_covariance(sensor) is None, sensor.constants if landmark else sensor.parameters
@@ -256,25 +244,24 @@ def view_of(
     return (
         address_of(linearize_ranges if plain else linearize_chain, LINEARIZE),
         _address(None if plain else links, LINKS),
-        address_of(COMPOSES[len(mount)], COMPOSE),
-        _address(chains and chains[len(mount) != 3], CHAIN),
+        _address(chain, CHAIN),
         _address(landmark and landmark.look, LOOK),
         _address(type(sensor).expected, EXPECT),
         _address(None if known else type(sensor).varied, VARY),
         _address(type(motion).velocity if of_state else None, VELOCITY),
         int(sensor.code),
         mount,
-        since if landmark and chains else np.array(numbers, dtype=np.float64),
+        since if landmark and chain else np.array(numbers, dtype=np.float64),
         angular,
-        _address(MOUNTS_AGO[len(mount)] if len(past) else None, MOUNT_AGO),
+        _address(mount_ago if len(past) else None, MOUNT_AGO),
         past,
     )
 
 
 def links_of(sensor: Any, landmark: Any, motion: Any) -> tuple[Any, Any, bool]:
-    """Return the links of a sensor, its chains in plane and space, and whether they are of its robot's state.
+    """Return the links of a sensor, its chain, and whether that is of its robot's state.
 
-    A sensor that sees nothing but landmarks has no chains: None.
+    A sensor that sees nothing but landmarks has no chain: None.
     """
     if landmark is None:
         of_state = sees_state(sensor, motion)
@@ -328,14 +315,14 @@ def _looked(view: Any, head: Array, l: Array, y: Array) -> tuple[Array, Array]:
 def sensor_at(view: Any, head: Array, address: int) -> tuple[Array, Array]:
     """Return the position (2 or 3,) of the sensor of a view, and its Jacobian in the head, by `sensor_address`."""
     if isinstance(view, tuple):
-        return call_sensor_at(address, (view[2], view[MOUNT], is_moving(view), head))
+        return call_sensor_at(address, (view[MOUNT], is_moving(view), head))
     moving = isinstance(view, PythonView) and view.moving
-    return call_sensor_at(address, (address_of(COMPOSES[len(view.mount)], COMPOSE), view.mount, int(moving), head))
+    return call_sensor_at(address, (view.mount, int(moving), head))
 
 
 @overload(sensor_at, strict=False)  # type: ignore[untyped-decorator]
 def _compiled_sensor_at(view: Any, head: Any, address: Any) -> Any:
-    return lambda view, head, address: call_sensor_at(address, (view[2], view[MOUNT], is_moving(view), head))
+    return lambda view, head, address: call_sensor_at(address, (view[MOUNT], is_moving(view), head))
 
 
 def sensor_address() -> int:
@@ -344,13 +331,13 @@ def sensor_address() -> int:
 
 
 @compiled
-def place_of_sensor(compose_at: int, at: Array, moving: int, head: Array) -> tuple[Array, Array]:
+def place_of_sensor(at: Array, moving: int, head: Array) -> tuple[Array, Array]:
     """Return the position S (2 or 3,) of a sensor whose mount is `at` or in the head (h,), and S_h (2 or 3, h).
 
     It does not depend on a block of the head that determines the velocity of a `moving` one.
     """
     pose, mounted = len(at), len(head) > len(at) and moving == 0
-    T, T_r, T_s = call_compose(compose_at, (head[:pose], head[pose : 2 * pose] if mounted else at))
+    T, T_r, T_s = compose_poses(head[:pose], head[pose : 2 * pose] if mounted else at)
     d, dof = 2 if pose == 3 else 3, len(T_r)
     S_h = np.zeros((d, dof if len(head) == pose else 2 * dof + len(head) - 2 * pose))
     for i in range(d):
@@ -364,7 +351,7 @@ def place_of_sensor(compose_at: int, at: Array, moving: int, head: Array) -> tup
 @compiled
 def is_moving(view: View) -> int:
     """Return 1 if the block behind the robot's pose in the head has the velocity of the sensor, 0 if it is a mount."""
-    return 1 if view[3] != 0 and view[4] != 0 else 0
+    return 1 if view[2] != 0 and view[3] != 0 else 0
 
 
 @compiled
@@ -373,7 +360,7 @@ def linearize_ranges(view: View, head: Array, l: Array, y: Array) -> tuple[Array
 
     The points stand at d from the sensor, in the axes of the map.  [S] (56), (61).
     """
-    at, (gain, offset) = view[MOUNT], view[10]
+    at, (gain, offset) = view[MOUNT], view[9]
     s = head[3:6] if len(head) > 3 else at
     cos, sin = math.cos(head[2]), math.sin(head[2])
     b_x, b_y = cos * s[0] - sin * s[1], sin * s[0] + cos * s[1]  # from the robot to the sensor
@@ -407,7 +394,7 @@ def linearize_chain(view: View, head: Array, l: Array, y: Array) -> tuple[Array,
 
     A block that is given behind the measurements, in y, is so in e.  E_h = E_v V_T T_h, and E_l = E_v V_l.
     """
-    _, links_at, _, _, look_at, expect_at, vary_at, velocity_at, code, at, par, angular, ago_at, _ = view
+    _, links_at, _, look_at, expect_at, vary_at, velocity_at, code, at, par, angular, ago_at, _ = view
     own = head[2 * len(at) + (ago_at != 0) if vary_at != 0 else len(head) :]
     measured, given = y[:, : len(angular)].copy(), y[:, len(angular) :].copy()
     v, V_T, T_h, V_l = call_links(links_at, (view, head, l, given))
@@ -432,12 +419,12 @@ def links_of_landmarks(view: View, head: Array, l: Array, given: Array) -> Links
     pose, mounted = len(at), len(head) > len(at)
     s = head[pose : 2 * pose] if mounted else at
     if view[AGO] == 0:
-        T, T_r, T_s = call_compose(view[2], (head[:pose], s))
+        T, T_r, T_s = compose_poses(head[:pose], s)
     else:
         B, B_s, B_lag = call_mount_ago(view[AGO], (s, head[2 * pose], view[PAST]))
-        T, T_r, T_B = call_compose(view[2], (head[:pose], B))
+        T, T_r, T_B = compose_poses(head[:pose], B)
         T_s = T_B @ append_columns(B_s, B_lag)
-    v, V_T, V_l = landmark_views.look(view[4], (T, given if known else l))
+    v, V_T, V_l = landmark_views.look(view[3], (T, given if known else l))
     return v, V_T, append_columns(T_r, T_s) if mounted else T_r, np.empty((len(v), V_l.shape[1], 0)) if known else V_l
 
 
@@ -450,7 +437,7 @@ def links_of_moving(view: View, head: Array, l: Array, given: Array) -> Links:
     at = view[MOUNT]
     pose = len(at)
     p, P_T, T_r, V_l = links_of_landmarks(view, head[:pose], l, given)
-    t, t_r, _, t_x = call_chain(view[3], (head[:pose], at, head[pose:], view[10], view[7]))
+    t, t_r, _, t_x = call_chain(view[2], (head[:pose], at, head[pose:], view[9], view[6]))
     k, d = p.shape
     n, others = T_r.shape[1], t_x.shape[1]
     v, V_T, T_h = np.empty((k, 2 * d)), np.zeros((k, 2 * d, n + d)), np.zeros((n + d, n + others))
@@ -465,11 +452,11 @@ def links_of_moving(view: View, head: Array, l: Array, given: Array) -> Links:
 @compiled
 def links_of_state(view: View, head: Array, l: Array, given: Array) -> Links:
     """Return the view v (1, d) of a robot and its second block l (1, n), the identity, V_h, and V_l."""
-    at, velocity_at = view[MOUNT], view[7]
+    at, velocity_at = view[MOUNT], view[6]
     pose, mounted = len(at), len(head) > len(at)
     first = 0 if velocity_at != 0 else max(0, given.shape[1] - 1)  # behind the mean of earlier readings, if given
     s = head[pose : 2 * pose] if mounted else at
-    v, V_r, V_s, V_l = call_chain(view[3], (head[:pose], s, l[0], given[0, first:], velocity_at))
+    v, V_r, V_s, V_l = call_chain(view[2], (head[:pose], s, l[0], given[0, first:], velocity_at))
     V_h = append_columns(V_r, V_s) if mounted else V_r
     n = len(V_r)
     return v.reshape((1, len(v))), np.eye(n).reshape((1, n, n)), V_h, V_l.reshape((1, n, V_l.shape[1]))

@@ -65,15 +65,12 @@ def some_numbers(v: Array, place: Array, P_v: Array, first: int, m: int) -> tupl
     """Return m numbers e (K, m) of a place (K, d), and E_v (K, m, n), from `first` on, then those of v (K, n)."""
     (k, n), d = v.shape, place.shape[1]
     e, E_v, numbers = np.empty((k, m)), np.zeros((k, m, n)), min(d, n)
-    for i in range(k):
-        for j in range(m):
-            a = first + j
-            if a < d:
-                e[i, j] = place[i, a]
-                for b in range(numbers):
-                    E_v[i, j, b] = P_v[i, a, b]
-            else:
-                e[i, j], E_v[i, j, a] = v[i, a], 1.0
+    for j in range(m):
+        a = first + j
+        if a < d:
+            e[:, j], E_v[:, j, :numbers] = place[:, a], P_v[:, a, :numbers]
+        else:
+            e[:, j], E_v[:, j, a] = v[:, a], 1.0
     return e, E_v
 
 

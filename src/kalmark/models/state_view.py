@@ -31,7 +31,7 @@ from kalmark.arrays import Array
 from kalmark.compiled import by_address, compiled, signature_of
 from kalmark.geometry import frames, frames3d
 from kalmark.geometry.angles import exponential_v, exponential_v_rate
-from kalmark.geometry.pose_frames import ORIGIN
+from kalmark.geometry.pose_frames import ORIGIN, compose_poses
 from kalmark.geometry.rotations import left_jacobian_inverse, left_jacobian_rate, log, matrix, skew
 from kalmark.models.protocols import (
     CHANGE,
@@ -57,79 +57,71 @@ Chain = tuple[Array, Array, Array, Array]
 
 # ------------------------------------------------------------------ what is seen of a state
 @compiled
-def pose_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return the pose T = r o s (3,), T_r and T_s (3, 3); there is no second block."""
-    T, T_r, T_s = frames.compose(r, s)
-    return T, T_r, T_s, np.zeros((3, 0))
+def pose_chain(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
+    """Return the pose T = r o s (3 or 7,), T_r and T_s (3, 3) or (6, 6); there is no second block."""
+    T, T_r, T_s = compose_poses(r, s)
+    return T, T_r, T_s, np.zeros((len(T_r), 0))
 
 
 @compiled
-def pose_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return the pose T = r o s (7,), T_r and T_s (6, 6); there is no second block."""
-    T, T_r, T_s = frames3d.compose(r, s)
-    return T, T_r, T_s, np.zeros((6, 0))
-
-
-@compiled
-def change_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return C = (l o s)^-1 o (r o s) (3,), the way of a mount s while its robot went from l to r, and Jacobians."""
-    A, A_l, A_s = frames.compose(l, s)
-    B, B_r, B_s = frames.compose(r, s)
-    I, I_A = frames.inverse(A)
-    C, C_I, C_B = frames.compose(I, B)
+def change_chain(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
+    """Return C = (l o s)^-1 o (r o s), the way of a mount s (3 or 7,) while its robot goes from l to r, Jacobians."""
+    A, A_l, A_s = compose_poses(l, s)
+    B, B_r, B_s = compose_poses(r, s)
+    I, I_A = frames.inverse(A) if len(A) == 3 else frames3d.inverse(A)
+    C, C_I, C_B = compose_poses(I, B)
     C_A = C_I @ I_A
     return C, C_B @ B_r, C_B @ B_s + C_A @ A_s, C_A @ A_l
 
 
 @compiled
-def change_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return C = (l o s)^-1 o (r o s) (7,), the way of a mount s while its robot went from l to r, and Jacobians."""
-    A, A_l, A_s = frames3d.compose(l, s)
-    B, B_r, B_s = frames3d.compose(r, s)
-    I, I_A = frames3d.inverse(A)
-    C, C_I, C_B = frames3d.compose(I, B)
-    C_A = C_I @ I_A
-    return C, C_B @ B_r, C_B @ B_s + C_A @ A_s, C_A @ A_l
+def mean_twist_chain(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
+    """Return the constant twist (3 or 6,) of a mount s with which its robot goes from l to r, and Jacobians."""
+    C, C_r, C_s, C_l = change_chain(r, s, l, since, velocity)
+    t, J = constant_twist_in_plane(C, since[0]) if len(C) == 3 else constant_twist_in_space(C, since[0])
+    return t, J @ C_r, J @ C_s, J @ C_l
 
 
 @compiled
-def mean_twist_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return the constant twist (vx, vy, w) of a mount s with which its robot goes from l to r, and Jacobians."""
-    C, C_r, C_s, C_l = change_in_plane(r, s, l, since, velocity)
+def constant_twist_in_plane(C: Array, seconds: float) -> tuple[Array, Array]:
+    """Return the constant twist (vx, vy, w) that leads to the pose C (3,) in so many seconds, and T_C (3, 3)."""
     p, q = exponential_v(C[2])
     p_a, q_a = exponential_v_rate(C[2])
     n = p * p + q * q
     x, y = (p * C[0] + q * C[1]) / n, (p * C[1] - q * C[0]) / n  # V (x, y) = (C_x, C_y)
     dx, dy = p_a * x - q_a * y, q_a * x + p_a * y
     J = np.array([[p / n, q / n, -(p * dx + q * dy) / n], [-q / n, p / n, (q * dx - p * dy) / n], [0.0, 0.0, 1.0]])
-    J /= since[0]
-    return np.array([x, y, C[2]]) / since[0], J @ C_r, J @ C_s, J @ C_l
+    return np.array([x, y, C[2]]) / seconds, J / seconds
 
 
 @compiled
-def mean_twist_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return the constant twist (v, w) (6,) of a mount s with which its robot goes from l to r, and Jacobians."""
-    C, C_r, C_s, C_l = change_in_space(r, s, l, since, velocity)
+def constant_twist_in_space(C: Array, seconds: float) -> tuple[Array, Array]:
+    """Return the constant twist (v, w) (6,) that leads to the pose C (7,) in so many seconds, and T_C (6, 6)."""
     turn = log(C[3:].copy())
     inverse = left_jacobian_inverse(turn)
     way, J, t = inverse @ C[:3].copy(), np.zeros((6, 6)), np.empty(6)
-    t[:3], t[3:] = way / since[0], turn / since[0]
-    J[:3, :3] = J[3:, 3:] = inverse / since[0]
-    J[:3, 3:] = -(inverse @ (left_jacobian_rate(turn, way) @ inverse)) / since[0]
-    return t, J @ C_r, J @ C_s, J @ C_l
+    t[:3], t[3:] = way / seconds, turn / seconds
+    J[:3, :3] = J[3:, 3:] = inverse / seconds
+    J[:3, 3:] = -(inverse @ (left_jacobian_rate(turn, way) @ inverse)) / seconds
+    return t, J
 
 
 def twist_between(before: Array, after: Array, seconds: float) -> Array:
     """Return the constant twist (3 or 6,) with which a robot goes from one pose, (3,) or (7,), to another."""
-    run = mean_twist_in_plane if len(before) == 3 else mean_twist_in_space
-    return np.asarray(run(after, ORIGIN[len(after)], before, np.array([seconds]), 0)[0])
+    return np.asarray(mean_twist_chain(after, ORIGIN[len(after)], before, np.array([seconds]), 0)[0])
 
 
 @compiled
-def twist_in_plane(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return the twist (vx, vy, w) of a mount s of a robot with the state l (n,), and Jacobians."""
+def twist_chain(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
+    """Return the twist (3 or 6,) of a mount s of a robot with the state l (n,), and Jacobians."""
     t, T_l = call_velocity(velocity, (l, since[1:].copy()))
-    return carried_in_plane(t, T_l, s)
+    return carried_twist(t, T_l, s)
+
+
+@compiled
+def carried_twist(t: Array, T_l: Array, s: Array) -> Chain:
+    """Return the twist of a mount s (3 or 7,) of a robot with the twist t (3 or 6,), whose Jacobian is T_l."""
+    return carried_in_plane(t, T_l, s) if len(t) == 3 else carried_in_space(t, T_l, s)
 
 
 @compiled
@@ -141,13 +133,6 @@ def carried_in_plane(t: Array, T_l: Array, s: Array) -> Chain:
     V_t = np.array([[c, d, d * s[0] - c * s[1]], [-d, c, c * s[0] + d * s[1]], [0.0, 0.0, 1.0]])
     V_s = np.array([[d * t[2], -c * t[2], v[1]], [c * t[2], d * t[2], -v[0]], [0.0, 0.0, 0.0]])
     return v, np.zeros((3, 3)), V_s, V_t @ T_l
-
-
-@compiled
-def twist_in_space(r: Array, s: Array, l: Array, since: Array, velocity: int) -> Chain:
-    """Return the twist (v, w) (6,) of a mount s of a robot with the state l (n,), and Jacobians."""
-    t, T_l = call_velocity(velocity, (l, since[1:].copy()))
-    return carried_in_space(t, T_l, s)
 
 
 @compiled
@@ -164,11 +149,11 @@ def carried_in_space(t: Array, T_l: Array, s: Array) -> Chain:
     return v, np.zeros((6, 6)), V_s, V_t @ T_l
 
 
-CHAINS: dict[tuple[str, bool], tuple[Any, Any]] = {  # by view, and whether it is of the state: in plane and space
-    (POSE, False): (pose_in_plane, pose_in_space),
-    (CHANGE, False): (change_in_plane, change_in_space),
-    (TWIST, False): (mean_twist_in_plane, mean_twist_in_space),
-    (TWIST, True): (twist_in_plane, twist_in_space),
+CHAINS: dict[tuple[str, bool], Any] = {  # by view, and whether it is of the state
+    (POSE, False): pose_chain,
+    (CHANGE, False): change_chain,
+    (TWIST, False): mean_twist_chain,
+    (TWIST, True): twist_chain,
 }
 
 
@@ -177,11 +162,10 @@ def seen(views: str, of_state: bool, motion: Any, r: Array, s: Array, l: Array, 
 
     `since` (1 + k,): the seconds since the last reading and, where the velocity is of the state, the control in force.
     """
-    s, space = np.array(s), len(s) != 3
+    s = np.array(s)
     if of_state:
-        carried: Any = (carried_in_plane, carried_in_space)[space]
-        return carried(*velocity_in(motion, l, since[1:]), s)
-    return CHAINS[views, False][space](np.array(r), s, np.array(l), np.array(since), 0)
+        return carried_twist(*velocity_in(motion, l, since[1:]), s)
+    return CHAINS[views, False](np.array(r), s, np.array(l), np.array(since), 0)
 
 
 def sees_state(sensor: OfState, motion: Any) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 
 from kalmark.arrays import Array
 from kalmark.geometry.pose_frames import ORIGIN
-from kalmark.models.observe import FOLLOW, sensor_pose
+from kalmark.models.observe import follow_twist, sensor_pose
 
 TINY_S = 1e-9
 SIZES = {3: 3, 6: 7}  # of a pose, by the size of a twist
@@ -45,12 +45,11 @@ class PastMotion:
         The place is in the frame of the robot now.  The scan is noted as the last one of its sensor.
         """
         since, self.scanned[sensor] = self.scanned.get(sensor, KEPT_S), 0.0
-        dof = self.twists.shape[1]
-        follow, place = FOLLOW[dof], ORIGIN[SIZES[dof]]
+        place = ORIGIN[SIZES[self.twists.shape[1]]]
         steps = self._within(0.0, lag_s) if lag_s > 0.0 else np.full(1, lag_s)
         steps[-1] += max(lag_s - self.seconds.sum(), 0.0)  # before the first motion it went on alike
         for seconds, twist in zip(steps.tolist(), self.twists, strict=False):
-            place = sensor_pose(place, follow(twist, -seconds)[0])[0] if seconds else place
+            place = sensor_pose(place, follow_twist(twist, -seconds)[0])[0] if seconds else place
         from_s = max(lag_s - 0.5 * since, 0.0)
         weights = self._within(from_s, from_s + since)
         twist = weights @ self.twists / max(weights.sum(), TINY_S)

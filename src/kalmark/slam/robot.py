@@ -122,8 +122,16 @@ class Mount:
         instance(self.sensor, Sensor, "Mount: sensor", "columns, angular, expect and noise")
         refuse_misspelt_names(self.sensor, "Mount: sensor")
         refuse_other_views(self.sensor, "Mount: sensor")
+        optional: tuple[tuple[str, Any, str], ...] = (
+            ("landmark", Landmark, "a landmark model"),
+            ("upkeep", Upkeep, "an Upkeep"),
+            ("initialization", (Delayed, Trilateration, Hypotheses), "a Delayed, a Trilateration or Hypotheses"),
+            ("classes", Classes, "a Classes"),
+        )
+        for name, kind, expected in optional:
+            if vars(self)[name] is not None:
+                instance(vars(self)[name], kind, f"Mount: {name}", expected)
         if self.landmark is not None:
-            instance(self.landmark, Landmark, "Mount: landmark", "a landmark model")
             refuse_misspelt_names(self.landmark, "Mount: landmark")
         if self.association is not None:
             refuse_odd_association(self.association, "Mount: association")
@@ -134,14 +142,6 @@ class Mount:
                 chosen: Any = replace(self.detector, signature="signature" in self.sensor.columns)  # type: ignore[type-var]
                 object.__setattr__(self, "detector", chosen)
         instance(self.attention, Attention, "Mount: attention", "an Attention")
-        if self.upkeep is not None:
-            instance(self.upkeep, Upkeep, "Mount: upkeep", "an Upkeep")
-        if self.initialization is not None:
-            ways = "a Delayed, a Trilateration or Hypotheses"
-            one_of: Any = (Delayed, Trilateration, Hypotheses)
-            instance(self.initialization, one_of, "Mount: initialization", ways)
-        if self.classes is not None:
-            instance(self.classes, Classes, "Mount: classes", "a Classes")
         check_parameters(self, "Mount: ")
         of_robot = f"but a {type(self.sensor).__name__} measures its robot, expected"
         if self.robust is not None and isinstance(self.sensor, OfState):

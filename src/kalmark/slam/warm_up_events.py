@@ -18,7 +18,7 @@ from kalmark.filter.compressed.compressed_map import CompressedMap
 from kalmark.filter.compressed.restoring import NUMBERS
 from kalmark.filter.compressed.storage import Triangle
 from kalmark.filter.map import StochasticMap
-from kalmark.geometry import frames, frames3d
+from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import VECTOR, VECTOR3
 from kalmark.management.repeated_places import find_repeats
 from kalmark.models.landmark_views import Spatial
@@ -229,9 +229,9 @@ class _Scene:
         self.v = views(self.sensor, rng)[0][:SEEN].copy()
         d, numbers = 2 if len(T) == 3 else 3, self.v.shape[1]
         if d == 2 or numbers in (3, 4) or isinstance(self.sensor, SeesVelocity):
-            here, rays = frames.from_frame_many if d == 2 else frames3d.from_frame_many, numbers == d + 1 == 4
+            rays = numbers == d + 1 == 4
             v = self.v[:, :d] / self.v[:, 3:] if rays else self.v[:, :d]
-            self.points = here(T, np.ascontiguousarray(v))[0]
+            self.points = FRAMES[len(T)].from_frame_many(T, np.ascontiguousarray(v))[0]
             self.places = None if rays else self.points
 
     def measured(self, T: Array) -> Array:
@@ -239,8 +239,7 @@ class _Scene:
         if self.fixed is not None:
             return self.fixed
         if self.places is not None:
-            seen_from = frames.to_frame_many if len(T) == 3 else frames3d.to_frame_many
-            self.v[:, : self.places.shape[1]] = seen_from(T, self.places)[0]
+            self.v[:, : self.places.shape[1]] = FRAMES[len(T)].to_frame_many(T, self.places)[0]
         y = np.tile([0.3 * (name == "size_m") for name in self.sensor.columns], (len(self.v), 1))
         e = self.sensor.expect(self.v, y)[0] if isinstance(self.sensor, Spatial) else self.sensor.expect(self.v)[0]
         return np.ascontiguousarray(e, dtype=np.float64)

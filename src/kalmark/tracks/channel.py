@@ -31,7 +31,7 @@ from kalmark.models.landmarks import (
     Tag,
     Wall2D,
 )
-from kalmark.models.observe import MOUNTS_AGO, is_built_in, landmark_at, linearize, sensor_pose, view_of
+from kalmark.models.observe import is_built_in, landmark_at, linearize, mount_ago, sensor_pose, view_of
 from kalmark.models.protocols import Landmark, Sensor, finds_depth, sees_kinds
 from kalmark.models.sensors import RangeBearing, TagPose
 from kalmark.models.state_view import velocity_of
@@ -120,7 +120,7 @@ class Channel:
     `motion` is that of its robot: a sensor that measures its velocity has it from the state; else it `counts`, from a
     clone of the robot's pose at its last scan.  `since` (1 + k,): the seconds since then, and the control in force
     where that has the turn rate.  `robust`: how outliers count less, "huber" or "student" (None: all count in full).
-    Of a sensor that `lags`, whose lag is in the map, `past` (7 or 14,) is that of its robot (`mount_ago_in_plane`).
+    Of a sensor that `lags`, whose lag is in the map, `past` (7 or 14,) is that of its robot (`mount_ago`).
     `classes` are those that the sensor reports of landmarks, None where it reports none.  Its scans determine where its
     robot is where it `locates` (by points of the plane) and, if all ids are known, where it `locates_by_ids`.
     """
@@ -258,7 +258,7 @@ class Channel:
         size = len(self.at)
         mount = observer[size : 2 * size] if len(observer) > size else self.at
         if self.lags:
-            mount = MOUNTS_AGO[size](mount, observer[2 * size], self.past)[0]
+            mount = mount_ago(mount, observer[2 * size], self.past)[0]
         return observer[:size], mount, observer[2 * size + self.lags :]
 
     def composed(self, map_: Map, robot: int) -> tuple[Array, Array, Array]:
@@ -346,7 +346,7 @@ class Channel:
             R = self.start_noise(y)[0]
         if self.lags:
             size = len(self.at)
-            _, B_s, B_lag = MOUNTS_AGO[size](observer[size : 2 * size], observer[2 * size], self.past)
+            _, B_s, B_lag = mount_ago(observer[size : 2 * size], observer[2 * size], self.past)
             L_h = np.concatenate([L_r[0], L_s[0] @ B_s, L_s[0] @ B_lag], axis=1)
         else:
             L_h = L_r[0] if self.mount < 0 else np.concatenate([L_r[0], L_s[0]], axis=1)
