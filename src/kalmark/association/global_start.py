@@ -27,7 +27,6 @@ from kalmark.geometry.pose_frames import FRAMES
 from kalmark.geometry.spaces import SE2, SE3
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.scan import FEWEST_RANGES
-from kalmark.tracks.survey_checks import SURVEYED
 
 FEWEST = 3  # pairs without ids
 FEWEST_NAMED = {2: 2, 3: 3}  # with ids, by the dimensions of the world
@@ -73,11 +72,6 @@ class Proposal(NamedTuple):
     matched: Index
     gain: float
     p: float = 0.0
-
-    def is_at(self, T: Array) -> bool:
-        """Return whether the pose is another one, T, within its covariance."""
-        off = (SE2 if len(T) == 3 else SE3).minus(self.T, T)
-        return bool(off @ np.linalg.solve(self.cov, off) <= chi2_gate(SURVEYED, len(off)))
 
 
 def locate_points(of: Known, ids: Sequence[Id | None], v: Array, sigma: Array) -> Proposal | str:

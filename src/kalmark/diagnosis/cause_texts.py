@@ -11,9 +11,10 @@ import numpy as np
 from kalmark.batch.motion_chain import TURNING
 from kalmark.config.tree import EACH, Configuration, value_at
 from kalmark.diagnosis.causes import TIMES, Finding
-from kalmark.diagnosis.error_columns import ALL, ALSO, ANGLES, DRIFT
+from kalmark.diagnosis.error_columns import ALL, ALSO, DRIFT
 from kalmark.diagnosis.jumps import LISTED, OddControl, step_size
-from kalmark.geometry.rotations import exp, from_euler, multiply, to_euler
+from kalmark.geometry.named_poses import POSES, describe_pose, pose_of
+from kalmark.geometry.rotations import exp, multiply
 from kalmark.results.figure_texts import figure
 from kalmark.slam.gaps import MARGIN
 
@@ -283,17 +284,16 @@ def odd_control_text(robot: str, odd: OddControl, times: Sequence[str] = ()) -> 
 
 def _mount(finding: Finding, config: Configuration) -> Words:
     robot, sensor, key = finding.of
-    mount, axes = _current(config, robot, "sensors", sensor, "mount") or {}, ANGLES[3]
-    about = f" about the {'xyz'[axes.index(key)]} axis of {robot}" if key in axes else ""
-    evidence = f"the sensor {_sensor(finding)} is turned by {_value(finding)}{_sure(finding)}{about}"
-    if "quaternion" in mount or not (about or key in ANGLES[2]):
-        return evidence, ""
-    if not about:
-        return evidence, _set(robot, f"sensors.{sensor}.mount.{key}", mount.get(key, 0.0) + finding.value)
-    stated = from_euler(np.radians([mount.get(axis, 0.0) for axis in axes]))[0]
-    turned = to_euler(multiply(exp(finding.value * np.eye(3)[axes.index(key)]), stated))[0]
-    lines = (_set(robot, f"sensors.{sensor}.mount.{a}", x) for a, x in zip(axes, np.degrees(turned), strict=True))
-    return evidence, " ".join(lines)
+    mount, axes = _current(config, robot, "sensors", sensor, "mount") or {}, POSES["space"][3:]
+    evidence = f"the sensor {_sensor(finding)} is turned by {_value(finding)}{_sure(finding)}"
+    at = f"sensors.{sensor}.mount"
+    if key not in axes:
+        return evidence, _set(robot, f"{at}.theta_rad", mount.get("theta_rad", 0.0) + finding.value)
+    about, pose = axes.index(key), pose_of(mount)
+    pose[3:] = multiply(exp(finding.value * np.eye(3)[about]), pose[3:])
+    turned = describe_pose(pose)
+    cure = "" if "quaternion" in mount else " ".join(_set(robot, f"{at}.{axis}", turned[axis]) for axis in axes)
+    return f"{evidence} about the {'xyz'[about]} axis of {robot}", cure
 
 
 _TELL: dict[str, Callable[[Finding, Configuration], Words]] = {

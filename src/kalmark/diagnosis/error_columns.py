@@ -14,12 +14,12 @@ from kalmark.batch.motion_chain import TURNING
 from kalmark.batch.problem import Factor
 from kalmark.diagnosis.linear import Linear
 from kalmark.geometry.angles import rotation
+from kalmark.geometry.named_poses import POSES as KEYS
 from kalmark.geometry.rotations import matrix
 from kalmark.models.observe import MOUNT, sensor_pose
 from kalmark.results.measures import pose_error
 
 MOST_SCALE = 0.25  # beyond it the problem is not linear: of a scale, and of a mount's share of the way to what it sees
-MOST_TURN = math.pi / 2  # of a mount, rad
 SLOW_S = 1e-3  # least time between two poses
 LENGTHS = ("range", "distance")  # how columns of lengths begin
 ALL = "all sensors"
@@ -28,7 +28,6 @@ DRIFT = "s/s"  # the unit of a clock that drifts
 LATE = "time_offset"
 SHARED = ("range_scale", "range_offset", "bearing_offset", LATE)  # errors of several sensors
 TURNED = "mount"  # a sensor that is turned
-ANGLES = {2: ("theta_rad",), 3: ("roll_deg", "pitch_deg", "yaw_deg")}  # keys of the turn of a mount, by axis
 
 Where = tuple[str, str]
 
@@ -122,9 +121,9 @@ def _of_sensor(
     yield LATE, factor.sensor, "s", math.inf, moving
     (observer, *_, seen), d = factor.term.blocks, state.d
     if (observer.group, seen.group) == (POSES, LANDMARKS) and (d > 2 or not any(map(is_bearing, names))):
-        for key, turn in zip(ANGLES[d], _turns(factor, state), strict=True):
+        for key, turn in zip(KEYS["plane" if d == 2 else "space"][d:], _turns(factor, state), strict=True):
             changed = np.nan_to_num(np.einsum("kij,kj->ki", E[:, :, : turn.shape[1]], turn))
-            yield TURNED, (*factor.sensor, key), "rad", MOST_TURN, changed
+            yield TURNED, (*factor.sensor, key), "rad", math.pi / 2, changed
     if observer.group == POSES:
         poses = state.groups[POSES][observer.rows]
         axes, away = _axes(poses), state.groups[seen.group][seen.rows, :d] - poses[:, :d]

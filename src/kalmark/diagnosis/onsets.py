@@ -14,7 +14,7 @@ import numpy as np
 
 from kalmark.arrays import Array, Index
 from kalmark.diagnosis.causes import LEAST_GAIN, LEAST_INFORMATION, SEEN, Finding, systematic
-from kalmark.diagnosis.error_columns import ALL, DRIFT, LATE, MOST_TURN, TURNED, Column
+from kalmark.diagnosis.error_columns import ALL, DRIFT, LATE, TURNED, Column
 from kalmark.diagnosis.linear import Linear
 from kalmark.events import Control, Event, Scan, sort_key
 from kalmark.logs.log import Log
@@ -49,7 +49,7 @@ def _as_turn(column: Column) -> Column:
     """Return an offset of bearings as the turn of its mount that it is, in the plane, and other errors as they are."""
     if column.name != "bearing_offset" or column.of[1] == ALL:
         return column
-    return column._replace(name=TURNED, Z=-column.Z, most=MOST_TURN)
+    return column._replace(name=TURNED, Z=-column.Z, most=math.pi / 2)
 
 
 def _times(linear: Linear, t_s: Array) -> tuple[Array, Array]:

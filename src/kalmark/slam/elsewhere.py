@@ -232,7 +232,10 @@ def _propose(state: State, scan: ScanContext, of: Evidence) -> None:
         of.since_ns = onset_ns
     old = older(state, scan, of)
     found = locate(state, scan, of, old)
-    if found is None or found.is_at(scan.pose()) or (by_shape and found.gain < of.gain):
+    if found is None or (by_shape and found.gain < of.gain):
+        return
+    off = state.moving[name].motion.space.pose.minus(found.T, scan.pose())
+    if off @ np.linalg.solve(found.cov, off) <= gate(SURVEYED, len(off)):  # there it is
         return
     other = state.pose_hypotheses[name] = PoseHypothesis.of(
         state.map, state.moving[name], state.blocks, scan.event.t_ns
