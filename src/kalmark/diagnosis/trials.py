@@ -190,11 +190,11 @@ class Trials:
         none, *left = (Trial(self, log, events, change) for change in changes)
         now, whole, before = UNUSED if none.run() is None else none.fit, self.work_of(events), 0.0
         left = left if _misfit(now) > SURELY else []
-        for k, share in enumerate(SHARES):  # each part after the first has as much of the budget
+        for k, share in enumerate(SHARES):  # each part has as much of the budget
             paid = (self.work - end) / (len(SHARES) - k) / (whole * (share - before) + PART)
-            most = max(1, int(paid)) if k else len(left)
-            likeliest = sorted(left, key=lambda one: -likelihood_gain(now, one.fit))[:most]
-            left = [one for one in left if one in likeliest]
+            gains = sorted(likelihood_gain(now, one.fit) for one in left)
+            # ties go on, as all do before the first part
+            left = [one for one in left if likelihood_gain(now, one.fit) >= gains[-max(1, int(paid)) :][0]]
             for one in track(left, f"mistakes in {share:.0%} of the first events", show=self.progress):
                 one.run(share)
             left = [one for one in left if len(one.fit.values)]
