@@ -168,7 +168,7 @@ def free_port() -> int:
 
 def test_one_program_waits_for_the_other_and_none_that_is_gone_stops_the_next(tmp_path: Path) -> None:
     live, port = a_live(tmp_path), free_port()
-    threading.Thread(target=serve, args=(live, port), daemon=True).start()
+    threading.Thread(target=serve, args=(live, port, 60.0, lambda: None, None), daemon=True).start()
 
     def connected() -> socket.socket:
         for _ in range(200):
@@ -206,7 +206,7 @@ def test_one_program_waits_for_the_other_and_none_that_is_gone_stops_the_next(tm
 
 def test_a_silent_program_and_one_of_another_protocol_are_told_so_and_left(tmp_path: Path) -> None:
     live, port = a_live(tmp_path), free_port()
-    threading.Thread(target=serve, args=(live, port, 1.0), daemon=True).start()
+    threading.Thread(target=serve, args=(live, port, 1.0, lambda: None, None), daemon=True).start()
 
     def said(*pieces: bytes) -> list[dict[str, Any]]:
         for _ in range(200):
