@@ -490,10 +490,6 @@ def diagnosis() -> Iterator[Figure]:
     rows = ["right and ok", "right and doubtful or unchecked", "right and wrong", "wrong and named", "wrong and ok"]
     yield Figure(section, f"200 logs of ten worlds from outside, 23 faults, without truth: {names}", "at most 2 wrong and ok",
                  "python benchmarks/verdict_truth.py LOGS", several(rows))  # fmt: skip
-    names = "first cause, of 40 faults / with harmless ones / clean ones accused, of 40 / carried robots found, of 20 / wrong and ok"
-    rows = ["first", "first or harmless", "clean accused", "carried found", "wrong and ok"]
-    yield Figure(section, f"100 logs of 30 families from outside, unseen until the code was frozen: {names}",
-                 "85 % / - / 1 % / 95 % / 1 %", "python benchmarks/verdict_truth.py LOGS", several(rows))  # fmt: skip
     for world in ("lever_arm", "wheels_and_gyro", "compass_and_gyro", "stop_and_go"):
         yield Figure(section, f"faults of sensors of the state, `{world}`: alarmed / named, of planted; good runs accused", "",
                      f"python benchmarks/diagnosis_readings.py {world} --seeds 2 --clean 10",
