@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import pdtrc
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.batch.batch_state import LANDMARKS, POSES
@@ -24,6 +25,7 @@ from kalmark.results.run import Run
 from kalmark.slam.relocation_by_fixes import NEEDED
 
 FEW = 0.01  # of landmarks or observations: a mistake about no more than these is weighed by what it does to the map
+LIKELY = 0.05  # the probability of so many outliers or marks, or more, up to which they are not by chance
 LEAST, MOST_OFF = 0.01, 0.2  # of the map's extent: what its shape may be off by, and what makes it wrong
 TOO_SURE = 0.8  # of the batch solution's sigma, below which the filter claims too much
 SIGMAS = 3.0  # of its own by which the shape of a doubtful map is off
@@ -48,6 +50,15 @@ class Effect:
     claimed: float | None = None
     dof: int = 0
     robots: dict[str, str] = field(default_factory=dict)
+
+
+def is_by_chance(number: int, of: int) -> bool:
+    """Return whether so many landmarks or observations, of all, may be marked or left out by chance: a share `FEW` is.
+
+    >>> is_by_chance(0, 3), is_by_chance(4, 300), is_by_chance(8, 300)
+    (True, True, False)
+    """
+    return number == 0 or float(pdtrc(number - 1, FEW * of)) > LIKELY
 
 
 def effect_of(run: Run, found: Searched) -> Effect:

@@ -19,6 +19,7 @@ from kalmark.arrays import Array
 from kalmark.config.tree import Configuration, robot_section, value_at
 from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.diagnosis.causes import LEAST_GAIN
+from kalmark.diagnosis.effect import is_by_chance
 from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, with_value
 from kalmark.diagnosis.trials import (
     FITS,
@@ -93,6 +94,12 @@ class FilteredRun(NamedTuple):
         """Return the sensors of the state whose readings do not fit: that is no chance."""
         dof = {where: int(self.fit.dof[self.of(where)].sum()) for where in self.sensors()}
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
+
+    def outlying(self) -> list[Where]:
+        """Return the sensors of the state of whose readings the filter left out more than by chance."""
+        left_out = self.run.history.outcome == "rejected"
+        rows = {where: self.of(where) for where in self.sensors()}
+        return [of for of, mine in rows.items() if not is_by_chance(int(left_out[mine].sum()), len(mine))]
 
 
 def filtered_with(trials: Trials, config: Configuration, log: Log, events: list[Event]) -> FilteredRun | None:

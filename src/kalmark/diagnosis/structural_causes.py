@@ -8,11 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import pdtrc
 
 from kalmark.diagnosis import doubled_landmarks, repeated_events
 from kalmark.diagnosis.cause_texts import odd_control_text
-from kalmark.diagnosis.effect import FEW
+from kalmark.diagnosis.effect import FEW, is_by_chance
 from kalmark.diagnosis.gross_mistakes import started_at
 from kalmark.diagnosis.jumps import LISTED
 from kalmark.diagnosis.lost import find_lost_robots
@@ -34,7 +33,6 @@ from kalmark.slam.relocation_by_fixes import NEEDED
 from kalmark.slam.surveyed_corrections import ELSEWHERE
 from kalmark.slam.tentative import ELSEWHERE as BEGUN_AGAIN
 
-LIKELY = 0.05  # the probability of so many marks, or more, up to which they are not by chance
 LEAST_S = 5.0  # for which a robot is lost at the end
 STOPPED_S = 1.0  # after a gap in the controls, within which a place is mapped again because of it
 MOST_PAIRS = 0.7  # of a repeat, of which one landmark was seen first before a gap, and the other one after it
@@ -147,10 +145,11 @@ def fits_nothing(run: Run) -> Iterator[Cause]:
 def readings_off(run: Run, log: Log, trials: Trials) -> tuple[list[Cause], bool]:
     """Return the faults of sensors of the state, those that still do not fit, and whether that explains the run.
 
-    They are further off than their noise and that of the pose allow.  More noise explains nothing with certainty.
+    They are further off than their noise and that of the pose allow, or some fit nothing: a constant that the map takes
+    up shows in its first readings alone.  More noise explains nothing with certainty.
     """
     now = fit_of_readings(run)
-    if not now.off() and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL):
+    if not now.off() and not now.outlying() and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL):
         return [], False
     found, after = reasons(run, log, trials)
     causes = [replace(cause_of_mistake(cause), since_s=begin_s(run)) for cause in found]
@@ -194,7 +193,7 @@ def unfitting_measurements(run: Run) -> list[Cause]:
     out = np.array([*(alone | (h.outcome == "rejected")), *(not fix.used for fix in h.fixes)], dtype=np.bool_)
     for name in np.unique(stream):
         number, left_out = int((stream == name).sum()), int(out[stream == name].sum())
-        if pdtrc(left_out - 1, FEW * number) < LIKELY:
+        if not is_by_chance(left_out, number):
             evidence = f"{left_out} of {number} {name} fit nothing in the map, and were left out"
             found.append(Cause(OUTLIERS, begin_s(run), 0.5 * MOST * left_out, evidence, "", True))
     return found
@@ -328,7 +327,7 @@ def unseen_landmarks(run: Run) -> Iterator[Cause]:
     """
     marks, h, found = run.landmarks, run.history, doubled_landmarks.unseen_counts(run)
     names = [name for name in marks.ids if name in marks.unseen]
-    by_chance = float(pdtrc(len(names) - 1, FEW * len(marks))) > LIKELY if names else True
+    by_chance = is_by_chance(len(names), len(marks))
     if names:
         where = dict(zip(marks.ids, marks.positions()[0].tolist(), strict=True))
         some = ", ".join(f"{name} at ({', '.join(f'{x:.1f}' for x in where[name])}) m" for name in names[:LISTED])

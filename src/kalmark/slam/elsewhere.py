@@ -140,24 +140,29 @@ def _note(state: State, scan: ScanContext, of: Evidence, look: existence.Observe
         of.miss(look.missed, [weight * log_miss for weight in look.missed.values()], t_ns, state.begun_ns)
     seen = [o for o in made if o.outcome == "associated" and (look is not None or o.id is not None)]
     if seen:
-        logs = _log_chance(scan, [o.index for o in seen], look.density if look is not None else 0.0)
-        of.see((o.landmark for o in seen if o.landmark is not None), -logs, t_ns, state.begun_ns)
+        d2 = np.array([0.0 if o.d2 is None else o.d2 for o in seen])
+        logs = _log_odds(scan, [o.index for o in seen], d2, look.density if look is not None else 0.0)
+        of.see((o.landmark for o in seen if o.landmark is not None), logs, t_ns, state.begun_ns)
     of.weigh()
 
 
-def _log_chance(scan: ScanContext, rows: list[int], density: float, Z: Array | None = None, p: float = 0.0) -> Array:
-    """Return the log probability (M,) that observations have a landmark of a density in their gates by chance.
+def _log_odds(
+    scan: ScanContext, rows: list[int], d2: Array, density: float, Z: Array | None = None, p: float = 0.0
+) -> Array:  # fmt: skip
+    """Return the log odds (M,) that observations are of their landmarks, and not of others that are there by chance.
 
-    It is at least p of those without ids.
+    That is the density of the innovations, of these d2 (M,), against that of landmarks.  By chance one is in the gate
+    with at least the probability p; with an id none is.
     """
     named = np.array([scan.ids[k] is not None for k in rows], dtype=np.bool_)
     if named.all():
-        return np.full(len(rows), -SURE)
-    V = scan.channel.calibrated(scan.map).invert(scan.y[rows])[1][:, :2]
+        return np.full(len(rows), SURE)
+    V, least = scan.channel.calibrated(scan.map).invert(scan.y[rows])[1][:, :2], gate(SURVEYED, 2)
     C = V @ (scan.report.Z[rows] if Z is None else Z) @ V.swapaxes(1, 2)
-    area = math.pi * gate(SURVEYED, 2) * np.sqrt(np.maximum(np.linalg.det(C), 0.0))
-    chance = np.where(named, math.exp(-SURE), np.minimum(np.maximum(density * area, p), 1.0))
-    return np.log(np.maximum(np.where(np.isfinite(chance), chance, 1.0), math.exp(-SURE)))
+    area = math.pi * least * np.sqrt(np.maximum(np.linalg.det(C), 0.0))
+    chance = np.maximum(density * area, p) * 2.0 / least
+    odds = -np.log(np.where(np.isfinite(chance), np.maximum(chance, math.exp(-SURE)), 1.0)) - 0.5 * d2
+    return np.where(named, SURE, np.clip(odds, -SURE, SURE))
 
 
 def older(state: State, scan: ScanContext, of: Evidence) -> Known:
@@ -274,7 +279,7 @@ def _try(state: State, scan: ScanContext, of: Evidence) -> None:
         names, rows = [old.names[row] for row in pairs], [*pairs.values()]
         update = view.known_update(model, old.values[[*pairs]], rows)._replace(gate=gate(SURVEYED, channel.dof))
         done = state.estimator.for_fixes().correct(other.map, update._replace(R=LOOSE**2 * update.R))
-        gains = np.where(done.fused, -_log_chance(scan, rows, old.density(), done.Z, of.p), -SURE)
+        gains = np.where(done.fused, _log_odds(scan, rows, done.d2, old.density(), done.Z, of.p), -SURE)
         fits = [*compress(names, done.fused)]
         each = zip(names, rows, gains.tolist(), done.fused.tolist(), strict=True)
         logs = {name: gain for name, k, gain, is_one in each if is_one or scan.ids[k] is not None}

@@ -113,9 +113,9 @@ class Evidence:
         return times[1:] - 1, *np.cumsum(changes, axis=1)[:, :-1]
 
     def count(self, logs: Mapping[Id, float]) -> None:
-        """Count landmarks for the second hypothesis, each once: one that was missed at first, when it is seen."""
+        """Count landmarks for the second hypothesis, each once: by the last time that it was seen, if it was."""
         for name, log in logs.items():
             before = self.fitted.get(name, 0.0)
-            if name not in self.fitted or before < 0.0 < log:
+            if name not in self.fitted or (before != 0.0 < log):  # those of the constellation count together
                 self.gain += log - before
                 self.fitted[name] = log
