@@ -206,7 +206,8 @@ def _meanings(again: Run, surveys: Mapping[str, Array], wrong: list[str]) -> dic
     h, (means, P), d = again.history, again.landmarks.positions(), again.history.d
     at = {str(name): k for k, name in enumerate(again.landmarks.ids)}
     places = {name: means[k] for name, k in at.items()}
-    told = {name: _told(h, places, name) for name in wrong}
+    values = fit_of_run(again).values
+    told = {name: _told(h, values, places, name) for name in wrong}
     for name in [name for name in wrong if name in surveys and not (h.id == name).any()]:
         k = at.get(_other(name))
         off = np.zeros(d) if k is None else means[k] - surveys[name]
@@ -256,12 +257,15 @@ def _in_order(h: History, name: str) -> list[tuple[str, Ints]]:
     return sorted(((of, mine) for of, mine in rows if len(mine)), key=lambda one: int(one[1][0]))
 
 
-def _told(h: History, places: Mapping[str, Array], name: str) -> str:
-    """Return the meaning of an id in a run with names for both of its places."""
+def _told(h: History, values: Array, places: Mapping[str, Array], name: str) -> str:
+    """Return the meaning of an id in a run with names for both of its places, of observations with a fit of `values`.
+
+    A thing that moves fits neither place.
+    """
     *before, (later, new) = _in_order(h, name)
     old = before[0][1] if before else new[:0]
     fits = h.outcome != "rejected"
-    if later not in places or any(len(rows) >= LEAST and fits[rows].mean() < MOST for rows in (old, new)):
+    if later not in places or any(len(rows) >= LEAST and values[rows].mean() > FITS for rows in (old, new)):
         return MOVES
     if fits[old[old > new.min()]].sum() > SHARE * len(old):
         return TWO

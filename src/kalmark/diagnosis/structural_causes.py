@@ -149,7 +149,11 @@ def readings_off(run: Run, log: Log, trials: Trials) -> tuple[list[Cause], bool]
     up shows in its first readings alone.  More noise explains nothing with certainty.
     """
     now = fit_of_readings(run)
-    if not now.off() and not now.outlying() and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL):
+    if (
+        not now.off()
+        and not now.outlying()
+        and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL)
+    ):
         return [], False
     found, after = reasons(run, log, trials)
     causes = [replace(cause_of_mistake(cause), since_s=begin_s(run)) for cause in found]
