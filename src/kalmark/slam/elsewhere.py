@@ -142,6 +142,7 @@ def _note(state: State, scan: ScanContext, of: Evidence, look: existence.Observe
     if seen:
         d2 = np.array([0.0 if o.d2 is None else o.d2 for o in seen])
         logs = _log_odds(scan, [o.index for o in seen], d2, look.density if look is not None else 0.0)
+        logs = np.maximum(logs, 0.0)  # a noise that is stated too small is no evidence
         of.see((o.landmark for o in seen if o.landmark is not None), logs, t_ns, state.begun_ns)
     of.weigh()
 

@@ -2,9 +2,9 @@
 
 It is that of what is observed from here against what a robot anywhere would observe.  Of each landmark
 
-    seen where it is expected        - log p,       p the probability that one is there by chance
+    seen where it is expected        log N(z; 0, Z) - log rho,  rho the density of landmarks
     expected, and not seen there     log(1 - p_D),  p_D its detection probability
-    observed, by its id, elsewhere   log p
+    observed, by its id, elsewhere   log p,         p the probability of that by chance
 
 and the ratio of an onset s is the sum of these over the landmarks that were begun before s and seen, or first missed,
 after it: those begun since then fit wherever the robot is.  The evidence is the least ratio of any onset (Page 1954).
