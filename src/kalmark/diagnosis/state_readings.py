@@ -13,13 +13,12 @@ from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from kalmark.arrays import Array
 from kalmark.config.tree import Configuration, robot_section, value_at
 from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.diagnosis.causes import LEAST_GAIN
-from kalmark.diagnosis.effect import is_by_chance
 from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, with_value
 from kalmark.diagnosis.trials import (
     FITS,
@@ -32,6 +31,7 @@ from kalmark.diagnosis.trials import (
     first_of,
     fit_of_run,
     likelihood_gain,
+    log_from,
 )
 from kalmark.events import Event
 from kalmark.geometry.gaussian import quantile
@@ -48,6 +48,7 @@ from kalmark.results.warnings import CHANCE, NOTICES
 SCANS = 800  # of the log are filtered again
 READINGS = "sensors of the state"
 MOST_CAUSES = 3
+WINDOW = 30  # readings that fit before those that do not
 CHANGES = 10  # of a sensor, or so
 ROUNDS, SAME = 3, 0.1  # in which a noise is found, and the share by which the last may change it
 WIDER = 2.0  # times larger is a sigma of a constant than the one that is stated, else it is tried already
@@ -95,11 +96,22 @@ class FilteredRun(NamedTuple):
         dof = {where: int(self.fit.dof[self.of(where)].sum()) for where in self.sensors()}
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
 
-    def outlying(self) -> list[Where]:
-        """Return the sensors of the state of whose readings the filter left out more than by chance."""
-        left_out = self.run.history.outcome == "rejected"
-        rows = {where: self.of(where) for where in self.sensors()}
-        return [of for of, mine in rows.items() if not is_by_chance(int(left_out[mine].sum()), len(mine))]
+    def parts_off(self) -> list[tuple[int, int]]:
+        """Return of each part of the readings of a sensor that does not fit, which is no chance, the first reading.
+
+        That is its number among these and its row.  A constant that the map takes up shows in the first readings alone.
+        """
+        found = []
+        for mine in map(self.of, self.sensors()):
+            dof = self.fit.dof[mine]
+            d2 = np.minimum(self.run.history.d2[mine], MOST * dof)
+            total = np.append(0.0, np.cumsum(d2 - MISFIT * dof))
+            end = int(np.argmax(total - np.minimum.accumulate(total)))
+            begin = int(np.argmin(total[: end + 1]))
+            part = slice(begin, end)
+            if chdtrc(max(dof[part].sum(), 1), d2[part].sum()) * len(mine) ** 2 < CHANCE:
+                found.append((begin, int(mine[begin])))
+        return found
 
 
 def filtered_with(trials: Trials, config: Configuration, log: Log, events: list[Event]) -> FilteredRun | None:
@@ -276,12 +288,16 @@ class _Sensor:
 def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], FilteredRun | None]:
     """Return the faults of sensors of the state in a run that does not fit, and the fit of the log without them.
 
-    Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.
+    Whatever sensor does not fit, all of them are tried: one that is wrong bends the path that the others see.  Where
+    readings fit at first the log is filtered from the first one on that does not.
     """
     if not run.config.get("robots") or run.stopped:
         return [], None
-    config, found, number = dict(run.config), list[Mistake](), CHANGES * len(fit_of_readings(run).tried())
-    events = first_events(run, log, SCANS)
+    as_it_is, found = fit_of_readings(run), list[Mistake]()
+    number, (before, row) = CHANGES * len(as_it_is.tried()), min(as_it_is.parts_off(), default=(0, 0))
+    config, part = log_from(run, log, row) if before >= WINDOW else (dict(run.config), log)
+    since_s = run.history.at_s(run.history.step[row if before >= WINDOW else 0])
+    events = first_events(run, part, SCANS)
     events = engine.payable(READINGS, run, events, number, number, share=RACED)
     now = filtered_with(engine, config, log, events) if events else None
     further = f"further causes in {READINGS}", number * engine.work_of(events)
@@ -292,7 +308,9 @@ def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], Filtered
         first = first_of(sorted((m for m in trials if m is not None), key=lambda m: -m.gain))
         if first is None:
             break
-        found.append(first)
+        found.append(first._replace(since_s=since_s))
         config, events = dict(first.config), [*map(first.change, events)] if first.change else events
         now = filtered_with(engine, config, log, events)
+    if before >= WINDOW:  # then no key takes it out
+        found = [one._replace(evidence=f"from t={since_s:.1f} s on {one.evidence}", cure="") for one in found]
     return found, now

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -145,18 +144,15 @@ def fits_nothing(run: Run) -> Iterator[Cause]:
 def readings_off(run: Run, log: Log, trials: Trials) -> tuple[list[Cause], bool]:
     """Return the faults of sensors of the state, those that still do not fit, and whether that explains the run.
 
-    They are further off than their noise and that of the pose allow, or some fit nothing: a constant that the map takes
-    up shows in its first readings alone.  More noise explains nothing with certainty.
+    They, or some in a row, are further off than their noise and that of the pose allow.  More noise explains nothing
+    with certainty.
     """
     now = fit_of_readings(run)
-    if (
-        not now.off()
-        and not now.outlying()
-        and (not now.sensors() or len(run.landmarks) or fit_of_run(run).mean < MISFITS_ALL)
-    ):
+    alone = now.sensors() and not len(run.landmarks) and fit_of_run(run).mean >= MISFITS_ALL
+    if not (now.off() or now.parts_off() or alone):
         return [], False
     found, after = reasons(run, log, trials)
-    causes = [replace(cause_of_mistake(cause), since_s=begin_s(run)) for cause in found]
+    causes = [*map(cause_of_mistake, found)]
     left = {*after.off()} if found and after is not None else {*now.off()}
     for robot, sensor in (of for of in now.off() if of in left):
         mine = now.of((robot, sensor))

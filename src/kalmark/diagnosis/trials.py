@@ -273,7 +273,7 @@ def _in_race(none: Fit, fits: Sequence[Fit], rest: float) -> Ints:
     before, more = _misfit(none, number // 2, number), max(0.0, _misfit(none, number))
     more *= min(1.0, won / before) if before > SURELY else 1.0
     sure = gain + more > SURELY * np.clip(mean, 1.0, FITS)
-    return np.flatnonzero((mean + rest < FITS * (1.0 + rest)) & (gain >= least) & sure)
+    return np.flatnonzero((mean + rest < MISFIT * (1.0 + rest)) & (gain >= least) & sure)
 
 
 def _misfit(of: Fit, begin: int = 0, end: int | None = None) -> float:
