@@ -31,11 +31,13 @@ from scipy.special import betaln
 
 from kalmark.arrays import Array, Flags, Index
 from kalmark.events import Id
+from kalmark.geometry.gaussian import gate
 from kalmark.management.upkeep import Upkeep
 from kalmark.tracks.channel import Channel, ObservationModel
 from kalmark.tracks.known_landmarks import Known
 from kalmark.tracks.looks import SIDE, Looks, cells_of, sectors_of
 from kalmark.tracks.scan import ScanContext
+from kalmark.tracks.survey_checks import SURVEYED
 from kalmark.tracks.track import Track, Tracks
 
 USED = ("associated", "new")
@@ -291,7 +293,7 @@ def _unclear(
     places = scan.channel.sensor.invert(scan.y[left])[0][:, : scan.dimensions]
     k = np.argmin(np.linalg.norm(v[some, None, : scan.dimensions] - places, axis=2), axis=1)
     d2 = scan.predict(model, scan.tracks.slots_of([names[i] for i in some]), [left[i] for i in k.tolist()])[1]
-    out[some] = ~(d2 > scan.channel.gate)
+    out[some] = ~(d2 > min(scan.channel.gate, gate(SURVEYED, scan.channel.dof)))
     return out
 
 
