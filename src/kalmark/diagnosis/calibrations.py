@@ -31,7 +31,7 @@ def calibrations(
     All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
     Those that it determines are estimated again without scales, which are not linear.
     """
-    columns = columns_of(linear, sensors_of(run), rates_of(linear, given.t_ns))
+    columns = [c for c in columns_of(linear, sensors_of(run), rates_of(linear, given.t_ns)) if not c.square]
     paths = [keys.calibration(run, column) for column in columns]
     joined: dict[Any, Column] = {}
     for column, path in zip(columns, paths, strict=True):

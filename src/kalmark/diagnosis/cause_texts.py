@@ -138,6 +138,17 @@ def _range_offset(finding: Finding, config: Configuration) -> Words:
     return _lengths(finding, "m"), _set(robot, f"sensors.{sensor}.bias_m", bias + finding.value) if known else ""
 
 
+def _height(finding: Finding, config: Configuration) -> Words:
+    robot, sensor = finding.of[:2]
+    section, height_m = _current(config, robot, "sensors", sensor) or {}, math.sqrt(finding.value)
+    evidence = f"ranges of {_sensor(finding)} are of things {figure(height_m)} m above or below it{_sure(finding)}"
+    if section.get("type") != "range":  # which has no height
+        return evidence, "log the distances along the ground"
+    return evidence, _set(
+        robot, f"sensors.{sensor}.mount.z_m", -math.hypot(section.get("mount", {}).get("z_m", 0.0), height_m)
+    )
+
+
 def _lengths(finding: Finding, unit: str) -> str:
     lengths, long = "ranges" if finding.of[2].startswith("range") else "distances", finding.value > 0
     off = f"{_size(abs(finding.value), unit)} too {'long' if long else 'short'}{_sure(finding)}"
@@ -300,6 +311,7 @@ _TELL: dict[str, Callable[[Finding, Configuration], Words]] = {
     "range_scale": _range_scale,
     "range_offset": _range_offset,
     "bearing_offset": _bearing_offset,
+    "height": _height,
     "time_offset": _time_offset,
     "mount_position": _mount_position,
     "odometry_scale": _odometry,

@@ -117,7 +117,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
             continue
         s = float(g[k] / I[k])
         moves = 0.0 if Z[:, k].any() else np.abs(s * W[:, k]).reshape(n, -1)[:, : linear.state.d].max(initial=0.0)
-        if abs(s) > column.most or moves > linear.step:
+        if abs(s) > column.most or moves > linear.step or (column.square and s < 0.0):
             continue  # no small error: the problem is not linear so far away
         parts = stretches(linear, Left(left.r[:, [k]], left.m[:, [k]]), np.array([s]))[0]
         sigma = float(np.sqrt(max(I[k], float(parts @ parts))) / I[k])

@@ -21,6 +21,7 @@ from kalmark.results.measures import pose_error
 
 MOST_SCALE = 0.25  # beyond it the problem is not linear: of a scale, and of a mount's share of the way to what it sees
 SLOW_S = 1e-3  # least time between two poses
+LEAST_RANGE_M = 1e-3
 LENGTHS = ("range", "distance")  # how columns of lengths begin
 ALL = "all sensors"
 ALSO = " and "  # between the columns of wheels that have an error together
@@ -28,6 +29,7 @@ DRIFT = "s/s"  # the unit of a clock that drifts
 LATE = "time_offset"
 SHARED = ("range_scale", "range_offset", "bearing_offset", LATE)  # errors of several sensors
 TURNED = "mount"  # a sensor that is turned
+HEIGHT = "height"  # of things above or below a sensor of the plane, its square
 
 Where = tuple[str, str]
 
@@ -35,7 +37,7 @@ Where = tuple[str, str]
 class Column(NamedTuple):
     """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,).
 
-    Beyond `most` of it the problem is not linear.
+    Beyond `most` of it the problem is not linear.  Of a `square` there is no negative one.
     """
 
     name: str
@@ -44,6 +46,11 @@ class Column(NamedTuple):
     Z: Array
     W: Array
     most: float = math.inf
+
+    @property
+    def square(self) -> bool:
+        """True if it is a square of what it is named after."""
+        return self.unit == "m2"
 
     @property
     def group(self) -> tuple[str, ...]:
@@ -111,7 +118,7 @@ def _of_sensor(
     """
     z, E = factor.term.at(state)
     if len(names) == z.shape[1]:
-        yield from _of_its_columns(factor, names, z)
+        yield from _of_its_columns(factor, names, z, state.d == 2)
     moving, first = np.zeros_like(z), 0
     for block in factor.term.blocks:
         dof = block.space.dof
@@ -154,9 +161,12 @@ def _turns(factor: Factor, state: BatchState) -> Iterator[Array]:
 
 
 def _of_its_columns(
-    factor: Factor, names: tuple[str, ...], z: Array
+    factor: Factor, names: tuple[str, ...], z: Array, plane: bool
 ) -> Iterator[tuple[str, tuple[str, ...], str, float, Array]]:
-    """Yield the errors of the columns of a sensor, as `_of_sensor`, whose innovations are z (K, p)."""
+    """Yield the errors of the columns of a sensor, as `_of_sensor`, whose innovations are z (K, p).
+
+    A range r of what is h higher, in the plane, is longer by about h^2 / 2 r.
+    """
     e, one = factor.y[:, : z.shape[1]] - z, np.ones_like(z)  # of a wall, not its ends
     longer = _longer(names, e)
     for c, name in enumerate(names):
@@ -164,6 +174,8 @@ def _of_its_columns(
         if name.startswith(LENGTHS) and name.endswith("_m"):
             yield "range_scale", of, "", MOST_SCALE, longer * mine
             yield "range_offset", of, "m", math.inf, one * mine
+            if plane:
+                yield HEIGHT, (*of, HEIGHT), "m2", math.inf, 0.5 * mine / np.maximum(np.abs(longer), LEAST_RANGE_M)
         elif name.endswith("_rad"):
             offset = "bearing_offset" if is_bearing(name) else f"{name.removesuffix('_rad')}_offset"
             yield offset, of, "rad", math.inf, one * mine
