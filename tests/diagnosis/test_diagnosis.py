@@ -101,6 +101,7 @@ FAULTS: dict[str, tuple[Change | None, tuple[str, ...], float | None]] = {
     "range_sigma": (None, (f"{SIGMA}=0.05",), 2.0),
     "bearing_offset": (measuring(lambda y: np.add(y, [0.0, 0.02])), (), 0.02),
     "range_scale": (measuring(lambda y: y * [1.06, 1.0]), (), 0.06),
+    "height": (measuring(lambda y: np.column_stack([np.hypot(y[:, 0], 1.5), y[:, 1]])), (), 1.5**2),
     "time_offset": (lambda e: seen(e, t_ns=e.t_ns + 100_000_000) if isinstance(e, Scan) else e, (), -0.1),
     "odometry_turn": (controlling(lambda u: np.add(u, [0.0, 0.02])), (), -0.02),
     "mount_position": (None, ("robots.rover.sensors.lidar.mount.y_m=0.5",), -0.5),

@@ -107,6 +107,22 @@ def test_a_robot_that_is_carried_away_is_found(ids: bool, surveyed: str, seed: i
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_carried_robot_is_found_though_somebody_walks_about(seed: int) -> None:
+    """In each scan is an observation of no landmark: the landmarks that are not near it are missed all the same."""
+    _, events, poses = carried_log(seed, ids=False)
+    rng, about = np.random.default_rng(seed), []
+    for event in events:
+        if isinstance(event, km.Scan):
+            y = np.vstack([event.y, rng.uniform((1.0, -2.0), (RANGE_M, 2.0))])
+            about.append(km.Scan(event.t_s, "rover", "laser", y))
+        else:
+            about.append(event)
+    off, carried = errors(slam_at(path(1)[0], ids=False), about, poses)
+    assert len(carried) == 1 and carried[0].end_ns * 1e-9 < 750 / RATE_HZ + 30.0
+    assert off[-300:].max() < 0.8
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_what_a_carried_robot_began_before_it_saw_an_old_landmark_is_none(seed: int) -> None:
     """With ids, it sees new trees alone for 1 s, which fit wherever it is; from then on old ones, too."""
     poses, jump, skip = path(3), 750, 200

@@ -189,9 +189,10 @@ def _places_of_ids(
     runs = [trials.filter(config, log, _renamed(log, first, np.flatnonzero(part), _other)) for part in parts]
     tried = [(likelihood_gain(fit_of_run(first), fit_of_run(run)), run) for run in runs if run is not None]
     gain, again = max(tried, key=lambda of: of[0], default=(0.0, first))
-    if again is first or fit_of_run(again).mean > FITS:
+    then = fit_of_run(again)
+    if again is first or then.mean > FITS:
         return None, [], 0.0
-    told = _meanings(again, surveys, names[wrong].tolist())
+    told = _meanings(again, then.values, surveys, names[wrong].tolist())
     if not told:
         return None, [], 0.0
     row = min(_in_order(again.history, name)[-1][1].min() for name in told)
@@ -201,12 +202,14 @@ def _places_of_ids(
     return (mistake, again), [*told], gain
 
 
-def _meanings(again: Run, surveys: Mapping[str, Array], wrong: list[str]) -> dict[str, str]:
-    """Return the meanings of ids in a run with names for both of their places; none of surveys that are right."""
+def _meanings(again: Run, values: Array, surveys: Mapping[str, Array], wrong: list[str]) -> dict[str, str]:
+    """Return the meanings of ids in a run with names for both of their places; none of surveys that are right.
+
+    Its observations fit with d2 per degree of freedom `values` (O,).
+    """
     h, (means, P), d = again.history, again.landmarks.positions(), again.history.d
     at = {str(name): k for k, name in enumerate(again.landmarks.ids)}
     places = {name: means[k] for name, k in at.items()}
-    values = fit_of_run(again).values
     told = {name: _told(h, values, places, name) for name in wrong}
     for name in [name for name in wrong if name in surveys and not (h.id == name).any()]:
         k = at.get(_other(name))
@@ -258,9 +261,9 @@ def _in_order(h: History, name: str) -> list[tuple[str, Ints]]:
 
 
 def _told(h: History, values: Array, places: Mapping[str, Array], name: str) -> str:
-    """Return the meaning of an id in a run with names for both of its places, of observations with a fit of `values`.
+    """Return the meaning of an id in a run with names for both of its places, with `values` as in `_meanings`.
 
-    A thing that moves fits neither place.
+    A thing that moves does not fit one place, nor two.
     """
     *before, (later, new) = _in_order(h, name)
     old = before[0][1] if before else new[:0]
