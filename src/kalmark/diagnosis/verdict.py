@@ -65,8 +65,8 @@ def diagnose(run: Run, most: int = AT_ONCE, *, brief: bool = False, progress: bo
 def _with_outliers(run: Run, verdict: Verdict) -> Verdict:
     """Return a verdict in which observations that fit nothing are a cause, if no other one explains them.
 
-    Where all others fit, they explain a misfit, and landmarks that began with one.  Harmless causes are the last, but
-    for a misfit that has no others: they may explain it.
+    Where all others fit, they explain a misfit, and landmarks that began with one.  Harmless causes are the last, of
+    these outliers, but for a misfit that has no others: they may explain it.
     """
     causes, fused, fine = verdict.causes, run.history.fused, verdict.map == OK
     if all(cause.name in OF_OUTLIERS and (cause.harmless or not cause.score) for cause in causes):
@@ -75,7 +75,12 @@ def _with_outliers(run: Run, verdict: Verdict) -> Verdict:
         kept = [cause for cause in causes if not found or cause.name not in (MISFIT, OUTLIERS)]
         causes = *(replace(cause, harmless=fine) for cause in found), *kept
     alone = all(cause.harmless for cause in causes if cause.name != MISFIT)
-    return replace(verdict, causes=(*sorted(causes, key=lambda c: c.name == MISFIT if alone else c.harmless),))
+
+    def rank(cause: Cause) -> tuple[bool, bool]:
+        last = cause.name == MISFIT if alone else cause.harmless
+        return last, cause.harmless and cause.name == OUTLIERS
+
+    return replace(verdict, causes=(*sorted(causes, key=rank),))
 
 
 def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:
