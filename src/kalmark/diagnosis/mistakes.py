@@ -26,10 +26,7 @@ TURNS_DEG = (180, 90, -90)
 OFFSETS_M = (-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0)  # of ranges
 HEIGHTS_M = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0)  # of beacons above a robot of the plane, or below it
 DEGREE = math.pi / 180
-LENGTHS = {
-    "millimetres": 1e-3, "centimetres": 1e-2, "decimetres": 0.1, "inches": 0.0254, "feet": 0.3048,
-    "tens of metres": 10.0, "hundreds of metres": 100.0, "kilometres": 1e3,
-}  # fmt: skip
+LENGTHS = {"millimetres": 1e-3, "centimetres": 1e-2, "decimetres": 0.1, "feet": 0.3048, "kilometres": 1e3}
 SPEEDS = {"kilometres per hour": 1 / 3.6, "miles per hour": 0.44704}
 TIMES = {"milliseconds": 1e-3, "microseconds": 1e-6}
 TURNS = ("w_radps", "dtheta_rad", "steering_rad")  # of controls of the plane, to the left
