@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -56,6 +57,25 @@ def test_what_is_wrong_with_a_receiver_is_named_with_its_figure(
     assert {key: float(value) for key, value in told.items()} == pytest.approx(cures, abs=0.15)
     assert first.score > 50 and np.isfinite(first.score)
     assert next(cause.name for cause in reasons(run, simulated.log, Trials())[0]) == name
+
+
+@pytest.mark.parametrize(
+    ("sensor", "number", "since_s", "by"),
+    [("compass", "declination_rad", 0.0, 0.3), ("gyro", "bias_radps", 30.0, 0.04)],
+)
+def test_a_constant_that_most_readings_fit_is_found(sensor: str, number: str, since_s: float, by: float) -> None:
+    """A declination turns the map, so that only the first readings do not fit; a bias may begin midway."""
+    sensors = "{lidar: {type: range_bearing, sigma_range_m: 0.1, sigma_bearing_rad: 0.03, range_max_m: 4.0}"
+    sensors += ", compass: {type: heading, sigma_heading_rad: 0.05}, gyro: {type: gyro, sigma_radps: 0.005}}"
+    world = load_world("compass_and_gyro", [f"robots.robot.sensors={sensors}", "robots.robot.sensing={}", "steps=600"])
+    log, change = simulation(world, 2).log.without_truth(), change_measurements({("robot", sensor)}, lambda y: y + by)
+    log = replace(log, events=[change(event) if event.t_s >= since_s else event for event in log])
+    run = km.record(build_slam(world.config(), log), log, progress=False, config=config_dict(world.config()))
+    first = diagnose(run, brief=True).causes[0]
+    assert first.name == "reading_offset" and first.since_s == pytest.approx(since_s, abs=5.0)
+    found = re.search(rf"readings of robot.{sensor} fit with {number} (-?[0-9.]+)", first.evidence)
+    assert found is not None and abs(float(found[1])) == pytest.approx(by, rel=0.35), first.evidence
+    assert first.evidence.startswith("from t=") == (since_s > 0.0) == (not first.cure)
 
 
 def test_a_right_receiver_is_not_accused() -> None:

@@ -14,7 +14,7 @@ from kalmark.config.tree import KeyPath
 from kalmark.diagnosis import causes
 from kalmark.diagnosis.batch_search import sensors_of
 from kalmark.diagnosis.causes import LEAST_GAIN, Finding
-from kalmark.diagnosis.error_columns import MOST_SCALE, Column, columns_of, rates_of, stacked
+from kalmark.diagnosis.error_columns import HEIGHT, MOST_SCALE, Column, columns_of, rates_of, stacked
 from kalmark.diagnosis.linear import Linear
 from kalmark.diagnosis.tunable_keys import Keys
 from kalmark.results.run import Run
@@ -31,7 +31,7 @@ def calibrations(
     All systematic errors are estimated together, so that one that the log does not determine has a large sigma.
     Those that it determines are estimated again without scales, which are not linear.
     """
-    columns = [c for c in columns_of(linear, sensors_of(run), rates_of(linear, given.t_ns)) if not c.square]
+    columns = [c for c in columns_of(linear, sensors_of(run), rates_of(linear, given.t_ns)) if c.name != HEIGHT]
     paths = [keys.calibration(run, column) for column in columns]
     joined: dict[Any, Column] = {}
     for column, path in zip(columns, paths, strict=True):

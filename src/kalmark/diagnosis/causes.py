@@ -16,7 +16,7 @@ from scipy.special import chdtr, chdtrc, chdtri, expit, ndtr
 from kalmark.arrays import Array, Flags
 from kalmark.batch.batch_state import LANDMARKS, Ints
 from kalmark.batch.motion_chain import START, UNKNOWN
-from kalmark.diagnosis.error_columns import Column, Where, stacked
+from kalmark.diagnosis.error_columns import HEIGHT, Column, Where, stacked
 from kalmark.diagnosis.linear import OUT, Left, Linear
 
 BLOCKS = 40  # stretches of a run; the variance of their scores is that of a sum of them
@@ -117,7 +117,7 @@ def systematic(linear: Linear, columns: list[Column]) -> list[Finding]:
             continue
         s = float(g[k] / I[k])
         moves = 0.0 if Z[:, k].any() else np.abs(s * W[:, k]).reshape(n, -1)[:, : linear.state.d].max(initial=0.0)
-        if abs(s) > column.most or moves > linear.step or (column.square and s < 0.0):
+        if abs(s) > column.most or moves > linear.step or (column.name == HEIGHT and s < 0.0):
             continue  # no small error: the problem is not linear so far away
         parts = stretches(linear, Left(left.r[:, [k]], left.m[:, [k]]), np.array([s]))[0]
         sigma = float(np.sqrt(max(I[k], float(parts @ parts))) / I[k])

@@ -21,7 +21,6 @@ from kalmark.results.measures import pose_error
 
 MOST_SCALE = 0.25  # beyond it the problem is not linear: of a scale, and of a mount's share of the way to what it sees
 SLOW_S = 1e-3  # least time between two poses
-LEAST_RANGE_M = 1e-3
 LENGTHS = ("range", "distance")  # how columns of lengths begin
 ALL = "all sensors"
 ALSO = " and "  # between the columns of wheels that have an error together
@@ -37,7 +36,7 @@ Where = tuple[str, str]
 class Column(NamedTuple):
     """A systematic error: what it is, and what one unit of it adds to the data, Z (N,) and W (q n,).
 
-    Beyond `most` of it the problem is not linear.  Of a `square` there is no negative one.
+    Beyond `most` of it the problem is not linear.  A height is its square: none is negative.
     """
 
     name: str
@@ -46,11 +45,6 @@ class Column(NamedTuple):
     Z: Array
     W: Array
     most: float = math.inf
-
-    @property
-    def square(self) -> bool:
-        """True if it is a square of what it is named after."""
-        return self.unit == "m2"
 
     @property
     def group(self) -> tuple[str, ...]:
@@ -175,7 +169,7 @@ def _of_its_columns(
             yield "range_scale", of, "", MOST_SCALE, longer * mine
             yield "range_offset", of, "m", math.inf, one * mine
             if plane:
-                yield HEIGHT, (*of, HEIGHT), "m2", math.inf, 0.5 * mine / np.maximum(np.abs(longer), LEAST_RANGE_M)
+                yield HEIGHT, (*of, HEIGHT), "m2", math.inf, 0.5 * mine / np.where(longer, longer, math.inf)
         elif name.endswith("_rad"):
             offset = "bearing_offset" if is_bearing(name) else f"{name.removesuffix('_rad')}_offset"
             yield offset, of, "rad", math.inf, one * mine

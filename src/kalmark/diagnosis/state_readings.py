@@ -19,6 +19,7 @@ from kalmark.arrays import Array
 from kalmark.config.tree import Configuration, robot_section, value_at
 from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.diagnosis.causes import LEAST_GAIN
+from kalmark.diagnosis.gross_mistakes import WINDOW
 from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, with_value
 from kalmark.diagnosis.trials import (
     FITS,
@@ -48,7 +49,6 @@ from kalmark.results.warnings import CHANCE, NOTICES
 SCANS = 800  # of the log are filtered again
 READINGS = "sensors of the state"
 MOST_CAUSES = 3
-WINDOW = 30  # readings that fit before those that do not
 CHANGES = 10  # of a sensor, or so
 ROUNDS, SAME = 3, 0.1  # in which a noise is found, and the share by which the last may change it
 WIDER = 2.0  # times larger is a sigma of a constant than the one that is stated, else it is tried already
@@ -96,10 +96,10 @@ class FilteredRun(NamedTuple):
         dof = {where: int(self.fit.dof[self.of(where)].sum()) for where in self.sensors()}
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
 
-    def parts_off(self) -> list[tuple[int, int]]:
-        """Return of each part of the readings of a sensor that does not fit, which is no chance, the first reading.
+    def parts_off(self) -> list[int]:
+        """Return the rows where parts of the readings of sensors begin that do not fit, which is no chance.
 
-        That is its number among these and its row.  A constant that the map takes up shows in the first readings alone.
+        It is 0 where that is at first: a constant that the map takes up shows in the first readings alone.
         """
         found = []
         for mine in map(self.of, self.sensors()):
@@ -110,7 +110,7 @@ class FilteredRun(NamedTuple):
             begin = int(np.argmin(total[: end + 1]))
             part = slice(begin, end)
             if chdtrc(max(dof[part].sum(), 1), d2[part].sum()) * len(mine) ** 2 < CHANCE:
-                found.append((begin, int(mine[begin])))
+                found.append(int(mine[begin]) * (begin >= WINDOW))
         return found
 
 
@@ -294,9 +294,9 @@ def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], Filtered
     if not run.config.get("robots") or run.stopped:
         return [], None
     as_it_is, found = fit_of_readings(run), list[Mistake]()
-    number, (before, row) = CHANGES * len(as_it_is.tried()), min(as_it_is.parts_off(), default=(0, 0))
-    config, part = log_from(run, log, row) if before >= WINDOW else (dict(run.config), log)
-    since_s = run.history.at_s(run.history.step[row if before >= WINDOW else 0])
+    number, row = CHANGES * len(as_it_is.tried()), min(as_it_is.parts_off(), default=0)
+    config, part = log_from(run, log, row) if row else (dict(run.config), log)
+    since_s = run.history.at_s(run.history.step[row])
     events = first_events(run, part, SCANS)
     events = engine.payable(READINGS, run, events, number, number, share=RACED)
     now = filtered_with(engine, config, log, events) if events else None
@@ -311,6 +311,6 @@ def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], Filtered
         found.append(first._replace(since_s=since_s))
         config, events = dict(first.config), [*map(first.change, events)] if first.change else events
         now = filtered_with(engine, config, log, events)
-    if before >= WINDOW:  # then no key takes it out
+    if row:  # then no key takes it out
         found = [one._replace(evidence=f"from t={since_s:.1f} s on {one.evidence}", cure="") for one in found]
     return found, now

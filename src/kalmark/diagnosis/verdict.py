@@ -24,7 +24,6 @@ from kalmark.results.run import Run
 from kalmark.results.warnings import TOO_SMALL, signs, window_warnings
 
 __all__ = ["Cause", "Effect", "Verdict", "diagnose"]
-AGAIN = "log filtered again without the mistake"  # what a verdict was made of
 OF_OUTLIERS = MISFIT, OUTLIERS, MISPLACED, MOVED  # causes that observations which fit nothing explain
 
 
@@ -75,12 +74,8 @@ def _with_outliers(run: Run, verdict: Verdict) -> Verdict:
         kept = [cause for cause in causes if not found or cause.name not in (MISFIT, OUTLIERS)]
         causes = *(replace(cause, harmless=fine) for cause in found), *kept
     alone = all(cause.harmless for cause in causes if cause.name != MISFIT)
-
-    def rank(cause: Cause) -> tuple[bool, bool]:
-        last = cause.name == MISFIT if alone else cause.harmless
-        return last, cause.harmless and cause.name == OUTLIERS
-
-    return replace(verdict, causes=(*sorted(causes, key=rank),))
+    causes = (*sorted(causes, key=lambda c: c.harmless and c.name == OUTLIERS),)
+    return replace(verdict, causes=(*sorted(causes, key=lambda c: c.name == MISFIT if alone else c.harmless),))
 
 
 def _with_left_out(run: Run, verdict: Verdict, trials: Trials) -> Verdict:
@@ -119,7 +114,11 @@ def _of_causes(run: Run, log: Log, most: int, trials: Trials) -> Verdict:
             return verdict
         return replace(verdict, map=worst_status(verdict.map, DOUBTFUL), causes=(cause, *verdict.causes))
     if without is None:
-        return Verdict(WRONG, (cause, *(c for c in first if c.name in (COPIES, "gap") or c in off)), AGAIN)
+        return Verdict(
+            WRONG,
+            (cause, *(c for c in first if c.name in (COPIES, "gap") or c in off)),
+            "log filtered again without the mistake",
+        )
     verdict = judged(run, log, first, most, trials)
     cured, after = with_cures(run, log, verdict, alarmed, most, trials, least=mistake.gain)
     others = verdict.search is not None and OUTLIERS not in [c.name for c in verdict.causes]

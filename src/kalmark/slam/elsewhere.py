@@ -140,7 +140,7 @@ def _note(state: State, scan: ScanContext, of: Evidence, look: existence.Observe
         of.miss(look.missed, [weight * log_miss for weight in look.missed.values()], t_ns, state.begun_ns)
     seen = [o for o in made if o.outcome == "associated" and (look is not None or o.id is not None)]
     if seen:
-        d2 = np.array([0.0 if o.d2 is None else o.d2 for o in seen])
+        d2 = np.nan_to_num(np.array([o.d2 for o in seen], dtype=np.float64))
         logs = _log_odds(scan, [o.index for o in seen], d2, look.density if look is not None else 0.0)
         logs = np.maximum(logs, 0.0)  # a noise that is stated too small is no evidence
         of.see((o.landmark for o in seen if o.landmark is not None), logs, t_ns, state.begun_ns)
