@@ -19,6 +19,7 @@ from kalmark.arrays import Array
 from kalmark.config.tree import Configuration, robot_section, value_at
 from kalmark.diagnosis.cause_texts import log_correction_line
 from kalmark.diagnosis.causes import LEAST_GAIN
+from kalmark.diagnosis.effect import LIKELY
 from kalmark.diagnosis.gross_mistakes import WINDOW
 from kalmark.diagnosis.mistakes import Mistake, Where, change_measurements, with_value
 from kalmark.diagnosis.trials import (
@@ -109,7 +110,7 @@ class FilteredRun(NamedTuple):
             end = int(np.argmax(total - np.minimum.accumulate(total)))
             begin = int(np.argmin(total[: end + 1]))
             part = slice(begin, end)
-            if chdtrc(max(dof[part].sum(), 1), d2[part].sum()) * len(mine) ** 2 < CHANCE:
+            if chdtrc(max(dof[part].sum(), 1), d2[part].sum()) * len(mine) ** (1 + (begin > 0)) < LIKELY:
                 found.append(int(mine[begin]) * (begin >= WINDOW))
         return found
 

@@ -75,6 +75,12 @@ class Fit(NamedTuple):
         """Its mean over the observations; that of a log that the filter refuses, or that has none, is infinite."""
         return float(self.values.mean()) if len(self.values) else math.inf
 
+    def first(self, number: int) -> Fit:
+        """Return the fit of the first observations; those that are missing count `MOST`."""
+        missing = np.zeros(max(0, number - len(self.values)))
+        padded = zip(self, (MOST, 1.0, -0.5 * MOST), strict=True)
+        return Fit(*(np.append(column, missing + one)[:number] for column, one in padded))
+
 
 REFUSED = Fit(np.zeros(0), np.zeros(0), np.zeros(0))
 UNUSED = Fit(
@@ -262,12 +268,12 @@ def _in_race(none: Fit, fits: Sequence[Fit], rest: float) -> Ints:
     may fit, and be as likely as the likeliest of each half so far, where the likeliest of all goes on as it did.  It
     gains no more than none misfits there, and of that no larger share than the best one did in the second half.
     """
-    number = min(len(of.values) for of in (none, *fits))
-    if number < 2 or not fits:
+    number = max((len(of.values) for of in fits), default=0)
+    if number < 2:
         return np.arange(len(fits))
-    halves = [0, number // 2]
-    likely = np.add.reduceat([of.likelihoods[:number] for of in (none, *fits)], halves, axis=1)
-    mean, total = np.array([of.values[:number].mean() for of in fits]), likely.sum(axis=1)
+    halves, firsts = [0, number // 2], [of.first(number) for of in (none, *fits)]
+    likely = np.add.reduceat([of.likelihoods for of in firsts], halves, axis=1)
+    mean, total = np.array([of.mean for of in firsts[1:]]), likely.sum(axis=1)
     gain, won = (total - total[0])[1:], (likely - likely[0]).max(axis=0)[1]
     least = ALIKE * gain.max() - rest * (likely.max(axis=0).sum() - total.max()) - (SURELY if rest else 0.0)
     before, more = _misfit(none, number // 2, number), max(0.0, _misfit(none, number))
