@@ -133,3 +133,20 @@ def test_scans_with_ids_that_are_given_again_count_once_and_are_named() -> None:
     assert cause.harmless and "of 200 scans of r.lidar repeat" in cause.evidence
     assert int(cause.evidence.split()[0]) > 130
     assert (run.history.reason == AGAIN).sum() == 3 * int(cause.evidence.split()[0])
+
+
+def test_scans_of_other_landmarks_each_time_show_what_is_given_again() -> None:
+    """No scan has the ids of the one before it: the differences of those in both are counted."""
+    rng, places = np.random.default_rng(4), np.random.default_rng(1).uniform(-8.0, 8.0, (12, 2))
+    mount = km.Mount(km.sensors.Position2D(0.05, 0.05))
+    slam = km.Slam(km.Robot("r", MOTION, sensors={"eye": mount}))
+    last: tuple[Any, list[int]] = np.zeros((0, 2)), []
+    found = []
+    for k in range(40):
+        slam.process(km.Control(0.1 * (k + 1), "r", (0.1, 0.0, 0.0)))
+        if k not in (30, 31, 32):
+            seen = sorted(rng.choice(12, 6 + k % 3, replace=False).tolist())
+            last = places[seen] - (0.1 * (k + 1), 0.0) + 0.05 * rng.normal(size=(len(seen), 2)), seen
+        report = slam.process(km.Scan(0.1 * (k + 1), "r", "eye", last[0], ids=last[1]))
+        found.append({o.reason == AGAIN for o in report.observations})
+    assert [k for k, again in enumerate(found) if again == {True}] == [30, 31, 32]

@@ -117,6 +117,14 @@ class LastMeasurement:
                 self._count()
         else:
             self._count()
+            if ids is not None and self.ids is not None and self.differ.max() < TOGETHER:
+                at = {name: k for k, name in enumerate(self.ids) if name is not None}
+                both = [(at[name], k) for k, name in enumerate(ids) if name in at]
+                if both:
+                    self.recent = [
+                        part[list(rows)] for part, rows in zip((last, y), zip(*both, strict=True), strict=True)
+                    ]
+                    self._count()
             self.recent = [y]
         self.ids, self.went, self.doubt = ids, NOTHING, NOTHING
         self._motions.clear()
