@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import compress
+from itertools import chain, compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -303,10 +303,9 @@ def reasons(run: Run, log: Log, engine: Trials) -> tuple[list[Mistake], Filtered
     now = filtered_with(engine, config, log, events) if events else None
     further = f"further causes in {READINGS}", number * engine.work_of(events)
     while now is not None and len(found) < MOST_CAUSES and (not found or (now.off() and engine.pays(*further))):
-        of = [_Sensor(engine, now, config, log, events, where) for where in now.tried()]
-        tried = (m for sensor in of for m in sensor.trials())
+        tried = chain.from_iterable(_Sensor(engine, now, config, log, events, of).trials() for of in now.tried())
         trials = track(tried, "sensors of the state, tried", show=engine.progress)
-        first = first_of(sorted((m for m in trials if m is not None), key=lambda m: -m.gain))
+        first = first_of(sorted(filter(None, trials), key=lambda m: -m.gain))
         if first is None:
             break
         found.append(first._replace(since_s=since_s))

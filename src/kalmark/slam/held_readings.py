@@ -117,14 +117,12 @@ class LastMeasurement:
                 self._count()
         else:
             self._count()
-            if ids is not None and self.ids is not None and self.differ.max() < TOGETHER:
-                at = {name: k for k, name in enumerate(self.ids) if name is not None}
-                both = [(at[name], k) for k, name in enumerate(ids) if name in at]
-                if both:
-                    self.recent = [
-                        part[list(rows)] for part, rows in zip((last, y), zip(*both, strict=True), strict=True)
-                    ]
-                    self._count()
+            if ids and self.ids and self.differ.max() < TOGETHER:
+                at = dict(zip(self.ids, range(len(last)), strict=True))
+                both = [(at[name], k) for k, name in enumerate(ids) if name is not None and name in at]
+                before, now = np.array(both, dtype=np.int64).reshape(-1, 2).T
+                self.recent = [last[before], y[now]]
+                self._count()
             self.recent = [y]
         self.ids, self.went, self.doubt = ids, NOTHING, NOTHING
         self._motions.clear()
@@ -132,7 +130,7 @@ class LastMeasurement:
 
     def _count(self) -> None:
         """Count the differences between the recent measurements."""
-        if len(self.recent) == 1:
+        if len(self.recent) == 1 or not self.recent[0].size:
             return
         y = np.array(self.recent)
         d = np.abs(np.diff(y, axis=0)).reshape(-1, y.shape[2])
