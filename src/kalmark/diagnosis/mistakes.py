@@ -136,9 +136,9 @@ def _of_columns(config: Mapping[str, Any], sensors: dict[Where, tuple[str, ...]]
         yield made("bearing_sign", evidence, turned or ["y_m"], -1.0)
     if angles:
         yield made("units", f"angles of {of} fit only if they are degrees", angles, DEGREE)
-    if names == ("range_m", "bearing_rad"):
-        evidence = f"range and bearing of {of} are swapped"
-        cure = "swap the columns range_m and bearing_rad"
+    if names in (("range_m", "bearing_rad"), ("x_m", "y_m")):
+        one, other = names
+        evidence, cure = f"{one} and {other} of {of} are swapped", f"swap the columns {one} and {other}"
         yield Mistake("swapped_columns", evidence, cure, config, change_measurements({*sensors}, lambda y: y[:, ::-1]))
     for unit, factor in LENGTHS.items() if lengths else ():
         yield made("units", f"distances of {of} fit only if they are {unit}", lengths, factor)

@@ -268,7 +268,7 @@ def _told(h: History, values: Array, places: Mapping[str, Array], name: str) -> 
     *before, (later, new) = _in_order(h, name)
     old = before[0][1] if before else new[:0]
     fits = h.outcome != "rejected"
-    if later not in places or any(len(rows) >= LEAST and values[rows].mean() > FITS for rows in (old, new)):
+    if later not in places or any(len(rows) >= LEAST and np.median(values[rows]) > FITS for rows in (old, new)):
         return MOVES
     if fits[old[old > new.min()]].sum() > SHARE * len(old):
         return TWO
