@@ -475,7 +475,9 @@ def race_track() -> Iterator[Figure]:
     for fault in ("clean", "60 ms late", "slipping", "spun", "no classes"):
         name = f"{fault}: laps with each cone once / path RMSE, m (worst) / at the end / a scan, ms (worst)"
         wanted = "95 % / .3 / .3 / 4 (20)"
-        yield Figure(section, name, wanted, command, row(fault, "{0} of {2} / {5} {6} / {7} {8} / {9} {10}"))
+        yield Figure(section, name, wanted, command, row(fault, "{0} of {2} / {5} {6} / {9} {10} / {11} {12}"))
+        name = f"{fault}: path RMSE of the batch solution of what the filter used, with its lag, m (worst)"
+        yield Figure(section, name, ".3", f"{command} --runs 6", row(fault, "{7} {8}"))
 
 
 def diagnosis() -> Iterator[Figure]:
