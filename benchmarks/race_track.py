@@ -4,7 +4,8 @@
 
 Every run has the filter that the world `race_track` ships with, but for a lag of 0 +- 0.1 s that it estimates; the
 faults are put into its log.  The truth only scores.  The path is that of the filter while it runs; that of the batch
-solution has all poses by all that the filter used, with its lag.
+solution has all poses by all that the filter used, with its lag.  The time of a scan is that of the controls before it,
+too.
 """
 
 from __future__ import annotations

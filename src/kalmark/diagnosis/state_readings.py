@@ -98,9 +98,10 @@ class FilteredRun(NamedTuple):
         return [of for of, m in dof.items() if self.mean(of) > max(MISFIT, float(quantile(1.0 - CHANCE, m)) / m)]
 
     def parts_off(self) -> list[int]:
-        """Return the rows where parts of the readings of sensors begin that do not fit, which is no chance.
+        """Return the rows where parts of the readings of sensors begin that do not fit, which chance seldom explains.
 
-        It is 0 where that is at first: a constant that the map takes up shows in the first readings alone.
+        The part is that of the largest sum of d2 less `MISFIT` (Page 1954).  It is 0 where that is at first: a constant
+        that the map takes up shows in the first readings alone.
         """
         found = []
         for mine in map(self.of, self.sensors()):

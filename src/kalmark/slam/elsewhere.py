@@ -152,8 +152,8 @@ def _log_odds(
 ) -> Array:  # fmt: skip
     """Return the log odds (M,) that observations are of their landmarks, and not of others that are there by chance.
 
-    That is the density of the innovations, of these d2 (M,), against that of landmarks.  By chance one is in the gate
-    with at least the probability p; with an id none is.
+    That is log N(z; 0, Z) - log rho of the innovations, of these d2 (M,), rho the density of landmarks.  By chance one
+    is in the gate with at least the probability p; with an id none is.
     """
     named = np.array([scan.ids[k] is not None for k in rows], dtype=np.bool_)
     if named.all():

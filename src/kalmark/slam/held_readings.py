@@ -42,6 +42,7 @@ class LastMeasurement:
     """The last measurement of a sensor, y (K, m) with its ids, and statistics of its numbers.
 
     `recent` are the last ones of the same ids, y the last of them; differences between them are counted many at a time.
+    Of two with other ids those of the ids in both are, until enough are known.
     Of each column: the `least` difference of successive measurements (0 of none), the sum of the logarithms of
     differences, and how many `differ` and are `equal`.  `went` and `doubt` (c,) are the controls since it was given and
     their variances.  `repeats` of `number` measurements were left out, since `since_ns`.
